@@ -132,6 +132,8 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
+        if any(name.lower().startswith(("lat", "lon")) for name in table.header):
+            remedy = "project latitude and longitude to metres, as UTM has them, in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     times = times_of(table, meant["time"]) if "time" in meant else None
     rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])

@@ -316,5 +316,7 @@ class Run:
         path = self.folder / name
         if not path.exists():
             text = f"{self.folder} has no {name}"
-            raise InputError("RIL-862", text, remedy="the report says what is missing, or run again")
+            ended = (self.folder / "report.html").exists()
+            remedy = "its report says what is missing" if ended else "it did not come to its end: run its command again"
+            raise InputError("RIL-862", text, remedy=remedy)
         return path

@@ -51,6 +51,7 @@ class DemFile:
     ``grid`` of elevations, metres, NaN unknown, in the CRS. ``crs`` WKT, empty where the file states none.
     ``viewpoints`` (n, 2) positions of the cameras in the CRS, where they are known. ``sigma`` (rows, cols) standard
     deviation of the elevations, metres, likewise. ``warnings``: what is suspicious but possible.
+    ``frame`` in words, where Rille wrote it.
     """
 
     name: str
@@ -59,6 +60,7 @@ class DemFile:
     viewpoints: NDArray[np.float64] | None = None
     sigma: NDArray[np.float64] | None = None
     warnings: tuple[str, ...] = ()
+    frame: str = ""
 
 
 def transform_of(grid: Grid) -> Affine:
@@ -164,7 +166,10 @@ def opened_raster(path: Path) -> Iterator[Any]:
                 yield file
         except (RasterioError, UnicodeDecodeError) as error:
             remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
-            raise InputError("RIL-629", f"{path} cannot be read as a raster ({error})", remedy=remedy) from error
+            if error.__cause__:  # GDAL has opened it, and then read less than it should have
+                remedy = "it breaks off or is damaged: copy it again"
+            text = f"{path} cannot be read as a raster ({error.__cause__ or error})"
+            raise InputError("RIL-629", text, remedy=remedy) from error
 
 
 def read_raster(path: Path) -> DemFile:
@@ -182,7 +187,7 @@ def read_raster(path: Path) -> DemFile:
             remedy = "give an elevation model; rille localize takes images by --ortho"
             raise InputError("RIL-636", f"{path} has colours, no elevations", remedy=remedy)
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-        crs, transform, unit = file.crs, file.transform, file.units[0]
+        crs, transform, unit, frame = file.crs, file.transform, file.units[0], file.tags().get("FRAME", "")
     wkt = _checked_system(path, transform, crs)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
@@ -193,7 +198,7 @@ def read_raster(path: Path) -> DemFile:
         remedy = "convert it, e.g. with gdal_calc"
         raise InputError("RIL-632", f"{path} has elevations in {unit!r}, not in metres", remedy=remedy)
     doubt = warning("RIL-962", f"{path} states no unit of its elevations: taken as metres")
-    return DemFile(str(path), _placed(values, transform), wkt, warnings=() if unit else (doubt,))
+    return DemFile(str(path), _placed(values, transform), wkt, warnings=() if unit else (doubt,), frame=frame)
 
 
 def read_ortho(path: Path) -> tuple[Grid, str]:
@@ -292,6 +297,8 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
         if first != second and set(names) != {own} and CRS.from_user_input(first) != CRS.from_user_input(second):
             text = f"{a} is in {names[0]}, {b} in {names[1]}"
             remedy = "bring one to the other's system first, e.g. with gdalwarp -t_srs"
+            if own in names:
+                remedy = "rille localize RUN MAP finds a run's place; state it in the manifest ([world]), and run again"
             raise InputError("RIL-615", text, remedy=remedy)
 
 

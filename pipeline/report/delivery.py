@@ -251,8 +251,8 @@ def _path(view: RunView) -> Items:
         return [_item("no path", "No path", "the path over the merged terrain was not computed")]
     if path.meta.get("found"):
         return []
-    row, y = path.meta.get("blocking_row"), path.meta.get("blocking_y")
-    where = "" if row is None else f"; blocked at row {row}" + ("" if y is None else f", {y:.3g} m ahead")
+    y = path.meta.get("blocking_y")
+    where = "" if y is None else f"; blocked {y:.3g} m ahead"
     return [_item("no path", "No path", (path.meta.get("reason") or "the far row cannot be reached") + where)]
 
 

@@ -290,6 +290,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
 
 def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict[str, Any]:
     """Write everything that the run leaves; give what ``report.json`` holds."""
+    from rille.pipeline.report.delivery import is_complete
     from rille.pipeline.runs import run_files
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
@@ -300,7 +301,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / LEDGER, total=total)
+    events.add_facts(opened.folder / LEDGER, total=total, holes=not is_complete(report["missing"]))
     return report
 
 

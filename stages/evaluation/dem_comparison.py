@@ -27,6 +27,8 @@ MIN_KNOWN_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
 BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
 MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
+MIN_RELIEF_CELLS = 100  # known to both, from which on their relief is compared
+MIN_EXPLAINED = 0.9  # share of the relief's variance that a common factor explains
 
 
 def cell_means(fine: Grid, target: Grid) -> Floats:
@@ -151,6 +153,19 @@ def errors(a: Grid, b: Grid, T_b_a: RigidTransform | None = None) -> Floats:
         return a.values - b.values
     moved = T_b_a.apply(a.points())
     return np.asarray(moved[..., 2] - b.at(moved[..., :2]))
+
+
+def relief_factor(a: Grid, b: Grid) -> float:
+    """Factor of B's elevations that explains nine tenths of A's but for a plane (runs may lean); 1 where none does."""
+    known = np.argwhere(np.isfinite(errors(a, b)))
+    if len(known) < MIN_RELIEF_CELLS:
+        return 1.0
+    row, col = known[:: len(known) // MAX_POINTS + 1].T
+    z = np.stack([a.values[row, col], b.values[row, col]], axis=-1)
+    plane = np.stack([row, col, np.ones(len(z))], axis=-1)
+    relief = z - plane @ np.linalg.lstsq(plane, z)[0]
+    (saa, sab), (_, sbb) = relief.T @ relief
+    return float(sab / sbb) if sab**2 > MIN_EXPLAINED * saa * sbb else 1.0
 
 
 def figures(error: Floats) -> dict[str, float]:

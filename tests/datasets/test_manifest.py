@@ -423,7 +423,7 @@ def test_unit_and_lever_arm_of_the_truth(tmp_path):
 @pytest.mark.parametrize(
     ("more", "lines", "expected"),
     [
-        ("", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat", "columns = ")),
+        ("", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat", "project")),
         ("", ["1 2 3", "2 3 4"], ("RIL-805", "3 without names")),
         ('columns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'", "time, x, y")),
         ("", ["x,y", "1,2", "2,3"], ("RIL-803", "2 positions for 3 pairs")),

@@ -10,6 +10,7 @@ from raising import raises
 
 from rille.datasets.images.masks import usable
 from rille.datasets.registry import open_sequence
+from rille.pipeline.commands.sequences.mask import mask
 
 DARK = np.s_[30:, :]
 """Rows of a mask that leave out a body at the bottom."""
@@ -42,14 +43,20 @@ def test_a_mask_leaves_out_what_is_dark(tmp_path, materialise, sides):
 
 @pytest.mark.parametrize("scale", [1, 255, 65535])
 def test_any_scale_means_the_same(scale):
-    mask = body(1).astype(np.uint16) * scale
-    np.testing.assert_array_equal(usable(mask), body() > 0)
+    drawn = body(1).astype(np.uint16) * scale
+    np.testing.assert_array_equal(usable(drawn), body() > 0)
 
 
 def test_traces_of_compression_are_dark():
-    mask = body()
-    mask[40, :] = 9
-    np.testing.assert_array_equal(usable(mask), body() > 0)
+    drawn = body()
+    drawn[40, :] = 9
+    np.testing.assert_array_equal(usable(drawn), body() > 0)
+
+
+def test_a_mask_that_somebody_drew_is_not_overwritten(tmp_path):
+    (tmp_path / "mask_right.png").write_bytes(b"drawn")
+    with raises("RIL-038", "mask_right.png"):
+        mask("mockup-short", output=tmp_path)
 
 
 def test_a_mask_that_changed_since_is_refused(tmp_path, materialise):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from rille.datasets.images.arrivals import Arrivals
+from rille.datasets.images.arrivals import SETTLE_SECONDS, Arrivals
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.complaints import complain
@@ -108,7 +108,9 @@ class _Watched:
         except InputError as error:
             if self.taken is None and not isinstance(error, IncompleteError):
                 raise
-            self.say(f"rille: waiting: {error.message}")
+            # Files that do not rest yet are no files: what lacks is known once they do.
+            if time.monotonic() - self.arrivals.changed > SETTLE_SECONDS:
+                self.say(f"rille: waiting: {error.message}")
             return None
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}

@@ -24,11 +24,11 @@ from rille.pipeline.export.read_dem import (
     refuse_unlike_systems,
     transform_of,
 )
-from rille.pipeline.export.writers import ENGINEERING_CRS, Meaning, write_bands
+from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.place import register
@@ -37,6 +37,8 @@ from rille.stages.terrain.grid import Grid
 
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""
+MAX_RELIEF_FACTOR = 2.0
+"""Between two models of one ground; a foot is .3 m."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
@@ -70,6 +72,9 @@ def compare_dem(
         Files to write, without ending.
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
+    raster, facts = named(output, ".tif"), named(output, ".json")
+    if raster.resolve() in {(path / "dem.tif" if path.is_dir() else path).resolve() for path in paths}:
+        raise ConfigError("RIL-043", f"--output and a model are both {raster}", remedy="give another name")
     one, other = (read_elevation(path) for path in paths)
     place = None
     if align == "place":
@@ -85,6 +90,10 @@ def compare_dem(
         place = {"motion_of_a": motion.tolist(), "by": placed.by}
         one, align = moved(one, motion), "rigid"
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
+    if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
+        name = (one if one.frame == ON_PLANE else other).name
+        text = f"elevations of {name} are distances from a plane that is no ground"
+        raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:
@@ -95,7 +104,6 @@ def compare_dem(
         rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
         lines += _change_table(figures["changes"])
     print("\n".join(lines))
-    raster, facts = named(output, ".tif"), named(output, ".json")
     atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     crs = (other if np.array_equal(cells.matrix, other.grid.matrix) else one).crs
     profile = {"driver": "COG", "crs": crs or None, "transform": transform_of(cells)}
@@ -148,6 +156,10 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
         "within the outline of A",
     }
+    factor = evaluation.relief_factor(on_a, on_b)
+    if not 1.0 / MAX_RELIEF_FACTOR < factor < MAX_RELIEF_FACTOR:
+        text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: is one of them in another unit"
+        figures["warnings"].append(warning("RIL-963", f"{text}{', or of depths' if factor < 0.0 else ''}?"))
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
     edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
     figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}

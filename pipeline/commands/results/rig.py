@@ -28,7 +28,7 @@ from rille.stages.calibration.parameter_selection import Parameter, decide
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
 from rille.stages.calibration.rig import RigParams
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.epipolar import NAMES, corrected
 from rille.stages.geometry.geometry import Rig
 
@@ -72,6 +72,8 @@ def rig(
         TOML file to write.
     """
     check_output(output, ".toml")
+    if output.exists() and "corrected_by_degrees" not in read_toml(output, "rig"):
+        raise ConfigError("RIL-038", f"{output} exists, and is no rig", remedy="give another --output")
     store, matches, given = Store(cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
     folders = list(dict.fromkeys(lookup.find(name, runs) for name in (run, *more)))
     for folder in folders:

@@ -40,7 +40,7 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             facts = events.facts(run / lookup.LEDGER)
             missing = statuses["failed"] + statuses["skipped"]
             # "ok": all tasks have ended; "total": the files and the report are written, too.
-            whole = "complete" if "total" in facts else "interrupted"
+            whole = "interrupted" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
             state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
             seconds = facts.get("total", facts.get("seconds"))

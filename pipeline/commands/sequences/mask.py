@@ -13,7 +13,7 @@ from rille.datasets.text.count import count
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import COMPLETE, Output
 from rille.pipeline.steps import open as open_sequence
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
@@ -31,6 +31,9 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     output
         Folder to write to.
     """
+    paths = {camera: output / f"mask_{camera}.png" for camera in CAMERAS}
+    if kept := [path for path in paths.values() if path.exists()]:
+        raise ConfigError("RIL-038", f"{kept[0]} exists", remedy="give another --output, or remove it")
     pairs = list(open_sequence(seq))
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"
@@ -44,7 +47,7 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
         if not body.any():
             print(f"{camera:12s} nothing keeps its place in {len(images)} images")
             continue
-        path = output / f"mask_{camera}.png"
+        path = paths[camera]
         seen = cv2.cvtColor(np.rint(grey(images[0])).astype(np.uint8), cv2.COLOR_GRAY2BGR)
         seen[body] = seen[body] // 2 + np.array([0, 0, 127], np.uint8)
         for name, picture in ((path, np.where(body, 0, 255).astype(np.uint8)), (path.with_suffix(".look.png"), seen)):

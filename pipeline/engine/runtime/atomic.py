@@ -25,8 +25,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    IsADirectoryError
-        A file was made, and ``path`` is a folder.
+    IsADirectoryError, NotADirectoryError
+        A file was made, and ``path`` is a folder, or the other way round.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     apart = _beside(path)
@@ -36,8 +36,9 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         with _named(path):
             yield apart / path.name
-        if path.is_dir() and not (apart / path.name).is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if path.exists() and path.is_dir() != (apart / path.name).is_dir():
+            number = errno.EISDIR if path.is_dir() else errno.ENOTDIR
+            raise OSError(number, os.strerror(number), str(path))
         if path.is_dir() and not path.is_symlink():
             # os.replace cannot replace a folder that is not empty.
             shutil.rmtree(path)

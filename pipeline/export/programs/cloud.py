@@ -101,7 +101,7 @@ def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> int:
     if len(first["x"]):
         header.offsets = [float(np.floor(first[axis].min())) for axis in "xyz"]
     # Ten steps of a coordinate in the median standard deviation across the ray of the first pair
-    step = np.median(first["sigma_across"]) / 10 if len(first["x"]) else 1e-3
+    step = float(np.median(first["sigma_across"])) / 10 if len(first["x"]) else 1e-3
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(step)))
     # With point formats 6 to 10 LAS 1.4 allows only WKT, and wants this bit set.
     header.vlrs.append(WktCoordinateSystemVlr(crs))

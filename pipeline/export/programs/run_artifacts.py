@@ -61,7 +61,7 @@ class RunArtifacts:
         begun = [name for name in self._rows if f"{name}/".startswith(f"{label}/")]
         if not begun:
             text = f"the run has no {label}"
-            remedy = "run the same command again if it was stopped; else its report says what failed"
+            remedy = "run the same command again if it was stopped; else its report says why"
             raise InputError("RIL-609", text, remedy=remedy)
         return self._open(label if label in begun else begun[-1 if last else 0])
 

@@ -15,6 +15,7 @@ from terrain_runs import LATTICE, PLACE, elevation, finished, hills
 
 from rille.pipeline import cli
 from rille.pipeline.commands.results import compare_dem
+from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 
 
 def compare(a: Path, b: Path, **options: Any) -> int:
@@ -76,6 +77,16 @@ def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.Ca
     assert "RIL-962: " in capsys.readouterr().err  # no unit
 
 
+@pytest.mark.parametrize(("factor", "said"), [(100.0, True), (1 / 0.3048, True), (-1.0, True), (1.3, False)])
+def test_another_unit_shows_in_the_relief(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float, said: bool
+) -> None:
+    """Neither the height of the datum nor a run that leans is taken for it."""
+    other = tiff(tmp_path / "b.tif", factor * elevation() + 50.0 + 0.1 * LATTICE.xy()[..., 0], 0.05, -1.0, 4.5)
+    assert compare(finished(tmp_path / "run"), other, output=tmp_path / "out") == 0
+    assert ("RIL-963: " in capsys.readouterr().err) is said
+
+
 def grid(path: Path, values: np.ndarray, cell: float, x0: float, y0: float) -> Path:
     """ESRI ASCII grid: lower left corner at (x0, y0)."""
     head = {"ncols": values.shape[1], "nrows": values.shape[0], "xllcorner": x0, "yllcorner": y0, "cellsize": cell}
@@ -97,6 +108,13 @@ def test_an_ascii_grid_is_as_good_as_a_tiff(tmp_path: Path, capsys: pytest.Captu
     assert "RIL-962: " in capsys.readouterr().err  # no unit
     (tmp_path / "b.prj").write_text(rasterio.crs.CRS.from_epsg(4326).to_wkt())
     assert "is in degrees" in refused(capsys, tmp_path / "a.tif", tmp_path / "b.ASC")
+
+
+def test_a_grid_that_breaks_off_is_named_as_that(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = grid(tmp_path / "whole.asc", elevation(), 0.05, -1.0, 1.0)
+    (tmp_path / "cut.asc").write_bytes(whole.read_bytes()[:9000])
+    assert "RIL-629" in (said := refused(capsys, tmp_path / "cut.asc", whole))
+    assert "copy it again" in said
 
 
 def test_a_tiff_without_a_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -160,8 +178,19 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert f"no known cell among {z.size}" in refused(capsys, empty, run)
     assert "cannot be read as a raster" in refused(capsys, tmp_path / "text.tif", run)
     assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
+    assert "RIL-043" in refused(capsys, run, away, "-o", tmp_path / "away")
+    assert "RIL-043" in refused(capsys, run, away, "-o", run / "dem")
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
+
+
+def test_distances_from_a_plane_are_not_compared_with_ground(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, wall = finished(tmp_path / "run"), finished(tmp_path / "wall")
+    write_raster(wall / "dem.tif", {"elevation": elevation()}, LATTICE, Meaning("m", tags={"frame": ON_PLANE}))
+    assert "RIL-842" in refused(capsys, run, wall)
+    assert compare(wall, wall, output=tmp_path / "out") == 0
 
 
 def test_changes_are_listed_with_their_places_and_volumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

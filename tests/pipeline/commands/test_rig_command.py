@@ -9,7 +9,7 @@ import pytest
 from raising import raises
 from rig_scenes import bed_depth, bed_rig, knocked, matches
 
-from rille.pipeline.commands.results.rig import _table, _toml, disagreements, joint
+from rille.pipeline.commands.results.rig import _table, _toml, disagreements, joint, rig
 from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.epipolar import NAMES
 
@@ -45,6 +45,12 @@ def test_a_rig_that_moved_between_runs_is_said():
     assert any("pitch of run c" in line for line in lines)
     assert len(list(_table(found))) == 1 + len(NAMES)
     assert tomllib.loads(_toml(found))["rig"] == found.rig.to_dict()
+
+
+def test_a_manifest_is_not_overwritten_by_a_rig(tmp_path):
+    (tmp_path / "rover.toml").write_text('[images]\nleft = "left/*.png"\n')
+    with raises("RIL-038"):
+        rig("latest", output=tmp_path / "rover.toml")
 
 
 def test_a_run_without_matches_is_refused():

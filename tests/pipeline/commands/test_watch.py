@@ -94,12 +94,18 @@ def nothing() -> None:
 
 def test_each_pair_is_taken_once_and_the_end_is_a_whole_run(scenario, capsys):
     f = scenario.folder
-    assert scenario.watch(lambda: pair(f, 0), nothing, nothing, lambda: pair(f, 1), nothing) == COMPLETE
+    assert scenario.watch(nothing, lambda: pair(f, 0), nothing, nothing, lambda: pair(f, 1), nothing) == COMPLETE
     assert scenario.runs == [(1, None, True), (2, None, True), (2, None, False)]
     assert [p.name for p in scenario.places["runs"].iterdir()] == ["3"], "results of earlier updates are replaced"
     out, err = capsys.readouterr()
     assert [line.split(": ")[-1] for line in out.splitlines()] == ["run 1", "run 2", "run 3"]
     assert err.count("images.left") == 1
+
+
+def test_images_that_are_there_are_not_said_to_be_missing(scenario, capsys):
+    pair(scenario.folder, 0)
+    assert scenario.watch() == COMPLETE
+    assert "waiting" not in capsys.readouterr().err
 
 
 def test_a_half_written_image_is_not_taken(scenario):

@@ -77,6 +77,9 @@ def test_a_file_never_takes_the_place_of_a_folder(tmp_path, full):
     with pytest.raises(IsADirectoryError, match="results"):
         atomic.write(folder, "a file")
     assert names(tmp_path) == ["results"] + full * ["thesis.txt"]
+    (tmp_path / "notes").write_text("years")
+    with pytest.raises(NotADirectoryError, match="notes"), atomic.replacing(tmp_path / "notes") as temporary:
+        temporary.mkdir()
 
 
 def test_no_other_module_moves_files_into_place():

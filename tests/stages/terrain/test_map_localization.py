@@ -137,6 +137,12 @@ def test_a_model_of_other_ground_has_no_place() -> None:
     assert unsure(scene(hills)[0], other, SearchArea(0.0, 0.0, 0.0, 1.5, math.pi))
 
 
+def test_a_map_in_another_unit_is_in_doubt_however_far_the_next_place() -> None:
+    z, local, ground = scene(hills)
+    found = fix(z, local, replace(ground, heights=100.0 * ground.heights), AROUND, PARAMS)
+    assert "of the relief" in found.doubt
+
+
 def test_a_map_elsewhere_is_refused_with_the_share_that_it_knows() -> None:
     model, ground = scene(hills)
     with raises("RIL-338", "50%"):
