@@ -74,6 +74,10 @@ def _damage(data: bytes) -> str:
     return ""
 
 
+def _damaged(text: str) -> InputError:
+    return InputError("RIL-170", text, remedy=COPY_AGAIN)
+
+
 def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
     """Image of an encoded file as it is stored, None: it cannot be decoded; and what speaks against it, in words.
 
@@ -154,7 +158,7 @@ def decode_colour(
     """
     damage = _damage(data)
     if damage:
-        raise InputError("RIL-170", f"{name} {damage}", remedy=COPY_AGAIN)
+        raise _damaged(f"{name} {damage}")
     header = _sound(read_header(BytesIO(data)), name)
     if wanted is not None:
         check_size(header._replace(depth=wanted.depth), wanted, name)
@@ -385,6 +389,5 @@ def sound(image: Bundle, path: str = "") -> Bundle:
         Its file is damaged.
     """
     if "damage" in image.meta:
-        text = f"frame {image.meta['frame']}, {image.meta['damage']}" + (path and f": {path}")
-        raise InputError("RIL-170", text, remedy=COPY_AGAIN)
+        raise _damaged(f"frame {image.meta['frame']}, {image.meta['damage']}" + (path and f": {path}"))
     return image

@@ -74,7 +74,7 @@ def compare_dem(
     paths = [lookup.elevation(text, runs) for text in (a, b)]
     raster, facts = named(output, ".tif"), named(output, ".json")
     if raster.resolve() in {(path / "dem.tif" if path.is_dir() else path).resolve() for path in paths}:
-        raise ConfigError("RIL-043", f"--output and a model are both {raster}", remedy="give another name")
+        raise ConfigError("RIL-964", f"--output and a model are both {raster}", remedy="give another name")
     one, other = (read_elevation(path) for path in paths)
     place = None
     if align == "place":
@@ -93,7 +93,7 @@ def compare_dem(
     if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
         name = (one if one.frame == ON_PLANE else other).name
         text = f"elevations of {name} are distances from a plane that is no ground"
-        raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
+        raise InputError("RIL-966", text, remedy="run it with --set terrain.reference=ground")
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:

@@ -78,7 +78,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     if len(set(folders)) < 2:
         raise ConfigError("RIL-849", "one run alone is merged with nothing", remedy="name two runs of one place")
     if output.is_dir() and any(output.iterdir()) and not (output / "merge.json").exists():
-        raise ConfigError("RIL-607", f"{output} is not empty", remedy="give a new folder with --output")
+        raise ConfigError("RIL-965", f"{output} is not empty", remedy="give a new folder with --output")
     first, *others = (Terrain.of(folder) for folder in dict.fromkeys(folders))
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])

@@ -73,7 +73,7 @@ def rig(
     """
     check_output(output, ".toml")
     if output.exists() and "corrected_by_degrees" not in read_toml(output, "rig"):
-        raise ConfigError("RIL-038", f"{output} exists, and is no rig", remedy="give another --output")
+        raise ConfigError("RIL-967", f"{output} exists, and is no rig", remedy="give another --output")
     store, matches, given = Store(cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
     folders = list(dict.fromkeys(lookup.find(name, runs) for name in (run, *more)))
     for folder in folders:

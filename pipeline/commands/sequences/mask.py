@@ -33,7 +33,7 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     """
     paths = {camera: output / f"mask_{camera}.png" for camera in CAMERAS}
     if kept := [path for path in paths.values() if path.exists()]:
-        raise ConfigError("RIL-038", f"{kept[0]} exists", remedy="give another --output, or remove it")
+        raise ConfigError("RIL-968", f"{kept[0]} exists", remedy="give another --output, or remove it")
     pairs = list(open_sequence(seq))
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"

@@ -138,8 +138,8 @@ def test_a_model_of_other_ground_has_no_place() -> None:
 
 
 def test_a_map_in_another_unit_is_in_doubt_however_far_the_next_place() -> None:
-    z, local, ground = scene(hills)
-    found = fix(z, local, replace(ground, heights=100.0 * ground.heights), AROUND, PARAMS)
+    model, ground = scene(hills)
+    found = fix(model, replace(ground, values=100.0 * ground.values), AROUND, PARAMS)
     assert "of the relief" in found.doubt
 
 
