@@ -28,8 +28,8 @@ from rille.datasets.mockup.scene import build_scene
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import RigidTransform, from_above, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.grid import Grid
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
+from rille.stages.terrain.relief.grid import Grid
 
 STEP, CELL, ERROR_M = 5, 0.001, 0.002
 DISTANCE_M, TURN = 2.0, math.radians(10.0)

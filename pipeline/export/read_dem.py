@@ -29,7 +29,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 MAX_CELLS = 500_000_000
 """Of an elevation model, which is read whole."""

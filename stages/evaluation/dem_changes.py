@@ -18,7 +18,7 @@ import scipy
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.numeric.robust import mad_sigma
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 SHIFT_CELLS = 0.25
 """By which the models may still be shifted."""

@@ -17,8 +17,8 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
-from rille.stages.terrain.grid import Grid
-from rille.stages.terrain.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, FitRules, condition, lay
+from rille.stages.terrain.relief.grid import Grid
+from rille.stages.terrain.relief.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, FitRules, condition, lay
 
 Align = Literal["shift", "tilt", "rigid"]
 
@@ -102,8 +102,8 @@ _AS_IT_IS = RigidTransform.identity()
 
 
 def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = _AS_IT_IS) -> Alignment:
-    """Motion that brings A onto B, by B's points on A (:mod:`rille.stages.terrain.height_fit`): the reference's slopes
-    are known better.
+    """Motion that brings A onto B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`): the reference's
+    slopes are known better.
 
     Parameters
     ----------

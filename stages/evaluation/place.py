@@ -19,8 +19,8 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.imaging.features import UNIT_BYTES, match
-from rille.stages.terrain.grid import Grid
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, fix
+from rille.stages.terrain.relief.grid import Grid
 
 KEYPOINTS = 8000
 """Of an image."""

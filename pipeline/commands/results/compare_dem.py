@@ -33,7 +33,7 @@ from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import from_above, rotation_log
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 SHOWN_CHANGES = 12
 """Patches that are printed; all are in the JSON file."""

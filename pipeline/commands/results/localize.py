@@ -30,8 +30,8 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.place import place
 from rille.stages.geometry.geometry import from_above, heading_of, rotation_exp, rotation_log
-from rille.stages.terrain.grid import Grid
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
+from rille.stages.terrain.relief.grid import Grid
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""

@@ -28,10 +28,10 @@ from rille.stages.evaluation.dem_comparison import Alignment
 from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.grid import Grid
 from rille.stages.terrain.map_localization import independent_cells
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
 from rille.stages.terrain.merge import merge as merge_layers
+from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.shading import gradient
 
 MAX_CELL_RATIO = 1.5

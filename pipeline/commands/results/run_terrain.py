@@ -17,7 +17,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 from rille.stages.evaluation.dem_changes import changes, standard_deviation
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 CELL, SHAPE = 0.01, (120, 160)
 GRID = Grid(np.zeros(SHAPE), np.array([[CELL, 0.0, 0.0], [0.0, CELL, 0.0]]))

@@ -9,7 +9,7 @@ from raising import raises
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment, align, binned, cell_means, common, errors, figures
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 
 def grid(values: np.ndarray, cell: float = 1.0, x0: float = 0.0, y0: float = 0.0, turn: float = 0.0) -> Grid:

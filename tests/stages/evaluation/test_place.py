@@ -11,7 +11,7 @@ import pytest
 from raising import raises
 
 from rille.stages.evaluation.place import place
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 
 def ground(seed):

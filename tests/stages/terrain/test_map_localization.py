@@ -14,8 +14,8 @@ from raising import raises
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import heading_of
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.terrain.grid import Grid
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix, thin
+from rille.stages.terrain.relief.grid import Grid
 
 Floats = NDArray[np.float64]
 CELL = 0.04

@@ -18,7 +18,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform, heading_of, orthonormal, rotation_exp, rotation_log
 from rille.stages.numeric.robust import mad_sigma
-from rille.stages.terrain.grid import Grid
+from rille.stages.terrain.relief.grid import Grid
 
 MAX_ROUNDS, SETTLED_CELLS = 30, 1e-3
 """Steps, and the greatest motion of a point in a step that ends them."""
