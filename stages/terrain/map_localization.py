@@ -8,8 +8,8 @@ map's cells, for single cells would differ from the map by their relief and not 
    are correlations of w, w z, w z^2 with k, k h, k h^2 (masked registration: Padfield 2012,
    doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for all places of a heading at once.
 2. The best places that are no neighbours are each refined on the map itself
-   (:mod:`rille.stages.terrain.relief.height_fit`) with Huber's weights. The slopes are those of the model, whose noise is less than the map's. The tilt has a prior,
-   ``sigma_tilt_deg``.
+   (:mod:`rille.stages.terrain.relief.height_fit`) with Huber's weights. The slopes are those of the model, whose noise
+   is less than the map's. The tilt has a prior, ``sigma_tilt_deg``.
 3. Neighbouring differences are correlated, the more so at a wrong place. With r their correlation at a distance of one
    cell, n cells count for n ((1 - r) / (1 + r))^2 independent ones, in the covariance, too. The chi2 by which a place
    is worse than the best one is this number times the logarithm of the ratio of their mean squares, so that no standard
