@@ -21,6 +21,7 @@ from numba import njit
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
+from rille.stages.geometry.projection import product
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
@@ -76,11 +77,9 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
 @njit(cache=True, nogil=True)
 def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
     """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 5)."""
-    line = np.empty(3)
     for n in range(len(left)):
         x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
-        for i in range(3):
-            line[i] = to_line[i, 0] * x + to_line[i, 1] * y + to_line[i, 2]
+        line = product(to_line, x, y)
         length = np.sqrt(line[0] ** 2 + line[1] ** 2)
         # A line has no sense of its own: its normal points down the image, or to the right where it is steep.
         if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
@@ -88,10 +87,7 @@ def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: igno
         d = (u * line[0] + v * line[1] + line[2]) / length
         distance[n] = d
         for p in range(5):
-            m = to_slopes[p]
-            a = m[0, 0] * x + m[0, 1] * y + m[0, 2]
-            b = m[1, 0] * x + m[1, 1] * y + m[1, 2]
-            c = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            a, b, c = product(to_slopes[p], x, y)
             # Quotient rule: the line's normal changes its length as well.
             slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Camera
@@ -46,6 +47,17 @@ def rotated(R, v):  # type: ignore[no-untyped-def]
         R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
         R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
         R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
+    )
+
+
+@register_jitable
+def product(m, x, y):  # type: ignore[no-untyped-def]
+    """``M (x, y, 1)`` as three numbers: of a homography the place that it maps x, y to, times the third number, which
+    is positive on this side of the horizon; of a fundamental matrix the line ``a x' + b y' + c = 0`` of x, y."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2],
     )
 
 

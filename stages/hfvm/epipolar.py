@@ -19,6 +19,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.geometry.projection import product
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
@@ -177,20 +178,10 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
     return along * b - c * a, -along * a - c * b
 
 
-@register_jitable
-def coefficients(f, x, y):  # type: ignore[no-untyped-def]
-    """Numbers a, b, c of the lines ``a x' + b y' + c = 0`` in the right image, of places in the left one."""
-    return (
-        f[0, 0] * x + f[0, 1] * y + f[0, 2],
-        f[1, 0] * x + f[1, 1] * y + f[1, 2],
-        f[2, 0] * x + f[2, 1] * y + f[2, 2],
-    )
-
-
 @njit(cache=True, nogil=True)
 def lines_at(f, x, y):  # type: ignore[no-untyped-def]
     """As :func:`lines`, of single pixels (n,): (3, n) float32."""
-    a, b, c = coefficients(f, x, y)
+    a, b, c = product(f, x, y)
     # Without a band all is zero, and 0 / 0 must stay 0.
     scale = 1.0 / np.maximum(np.sqrt(a * a + b * b), 1e-12)
     return np.stack((a * scale, b * scale, (c + a * x + b * y) * scale)).astype(np.float32)
@@ -218,7 +209,7 @@ def settled(f, u, v, wanted):  # type: ignore[no-untyped-def]
     for y in range(v.shape[0]):
         for x in range(v.shape[1]):
             if wanted[y, x]:
-                a, b, c = coefficients(f, x, y)
+                a, b, c = product(f, x, y)
                 if abs(b) > abs(a):
                     out[y, x] = -(a * (x + u[y, x]) + c) / b - y
     return out

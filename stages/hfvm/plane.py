@@ -20,11 +20,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numba import njit
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.cubic import cubic
+from rille.stages.geometry.projection import product
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Layer, Shape, Window
 from rille.stages.imaging.pyramid import filled_from
@@ -124,21 +124,10 @@ def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> 
     return filled_from(coarse, image, seen, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), valid
 
 
-@register_jitable
-def mapped(h, x, y):  # type: ignore[no-untyped-def]
-    """Column and row to which a homography maps a place, both to be divided by the third number, which is positive on
-    this side of the horizon."""
-    return (
-        h[0, 0] * x + h[0, 1] * y + h[0, 2],
-        h[1, 0] * x + h[1, 1] * y + h[1, 2],
-        h[2, 0] * x + h[2, 1] * y + h[2, 2],
-    )
-
-
 def _source(h: Matrix, window: Window, shape: Shape) -> Window:
     """Window of an image of ``shape`` that :func:`warp` reads for a window of its result."""
     y, x = np.meshgrid([window.y0, window.y1 - 1], [window.x0, window.x1 - 1], indexing="ij")
-    p, q, w = mapped(h, x, y)
+    p, q, w = product(h, x, y)
     if (w <= 1e-3).any():  # the horizon crosses it: a quadrangle does not hold it
         return Window(0, shape[0], 0, shape[1])
     # Near the horizon ends run off to numbers that no index holds; four pixels hold the cubic kernel.
@@ -163,7 +152,7 @@ def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
         for col in range(u.shape[1]):
             # In double precision: the difference of two columns must keep their fractions.
             x, y = np.float64(col + x0), np.float64(row + y0)
-            p, q, w = mapped(g, x + u[row, col], y + v[row, col])
+            p, q, w = product(g, x + u[row, col], y + v[row, col])
             # Points beyond the horizon would come back mirrored.
             w = w if w > 0.0 else np.nan
             out_u[row, col], out_v[row, col] = p / w - x, q / w - y
@@ -246,7 +235,7 @@ def finer(level: int) -> Matrix:
 
 def scale(h: Matrix, shape: Shape) -> float:
     """Pixels of the right image that one in the middle of an aligned image is wide and high, in the geometric mean."""
-    w = mapped(h, 0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))[2]
+    w = product(h, 0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))[2]
     # The determinant of the derivative of a homography.
     return math.sqrt(abs(float(np.linalg.det(h))) / abs(w) ** 3)
 
@@ -254,7 +243,7 @@ def scale(h: Matrix, shape: Shape) -> float:
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:
     """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
-    p, q, w = mapped(h, x, y)
+    p, q, w = product(h, x, y)
     # So near the horizon it is no ground but a bad fit, which infinity has refused.
     if (w <= 0.1).any():
         return np.inf
@@ -275,7 +264,7 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
             out[y, x], out_valid[y, x] = 0.0, 0
-            p, q, w = mapped(h, x, y)
+            p, q, w = product(h, x, y)
             if w <= 1e-6:
                 continue
             p, q = p / w, q / w

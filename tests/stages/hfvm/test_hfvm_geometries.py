@@ -5,6 +5,7 @@ import pytest
 from matching_scenes import pair, seen
 
 from rille.stages.core.validity import matched
+from rille.stages.geometry.projection import product
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.level import FREE_BAND, State, hand_down
@@ -53,7 +54,7 @@ def on_plane(h, share=1.0, level=2):
     """Matches of a level, a ``share`` of them on the plane of a homography of full resolution; and shapes of levels."""
     h, shape, rng = np.linalg.inv(plane.finer(level)) @ h @ plane.finer(level), (50, 60), np.random.default_rng(5)
     y, x = (a.ravel().astype(float) for a in np.indices(shape))
-    p, q, w = plane.mapped(h, x, y)
+    p, q, w = product(h, x, y)
     astray = rng.uniform(0, 1, x.size) > share
     u, v = (np.where(astray, d + rng.uniform(-12, 12, x.size), d) for d in (p / w - x, q / w - y))
     return Sample(x, y, u, v), [SHAPE, (100, 120), shape]
