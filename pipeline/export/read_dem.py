@@ -302,6 +302,12 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
             raise InputError("RIL-615", text, remedy=remedy)
 
 
+def no_ground(name: str) -> InputError:
+    """The error of elevations that are no heights of ground, where such are wanted."""
+    text = f"elevations of {name} are distances from a plane that is no ground"
+    return InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
+
+
 def _of_run(path: Path) -> DemFile:
     if not (path / "dem.tif").is_file():
         remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"

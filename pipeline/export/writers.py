@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
+from rille.stages.core.errors import ConfigError
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
@@ -75,6 +76,18 @@ class Meaning:
     def units(self, bands: Iterable[str]) -> list[str]:
         """Unit of each band."""
         return [self.unit if isinstance(self.unit, str) else self.unit[name] for name in bands]
+
+
+def check_folder(folder: Path, ours: str = "") -> None:
+    """Refuse a folder to write that holds something, unless it holds a file named ``ours`` and so is one of ours.
+
+    Raises
+    ------
+    ConfigError
+        It does.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (ours and (folder / ours).exists()):
+        raise ConfigError("RIL-607", f"{folder} is not empty", remedy="give a new folder with --output")
 
 
 def write_raster(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +13,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rille.pipeline.engine.plain import plain
+from rille.stages.core.errors import ConfigError
 
 COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -35,6 +37,8 @@ Run = Annotated[
 ]
 Runs = Annotated[Path, Parameter(help="Folder of results; each run makes RUNS/sequence/run-id.")]
 Unparsed = Parameter(parse=False)
+
+_NONE: Mapping[Path, str] = {}
 
 
 @Parameter(name="*")
@@ -159,18 +163,31 @@ def named(output: Path, ending: str) -> Path:
     return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
 
 
-def check_output(path: Path, *endings: str) -> None:
+def check_output(path: Path, *endings: str, option: str = "--output", others: Mapping[Path, str] = _NONE) -> None:
     """Refuse a name that the file to be written cannot have, before anything is computed.
+
+    Parameters
+    ----------
+    path : what ``option`` names.
+    endings : those of which it must have one; none: any.
+    others : what the command reads or writes besides, in words, by its resolved path.
 
     Raises
     ------
     ConfigError
-        ``path`` is a folder, or has none of the ``endings`` where there are any.
+        ``path`` is a folder, has another ending, or is one of the others.
     """
-    from rille.stages.core.errors import ConfigError
-
+    if path.resolve() in others:
+        text = f"{option} and {others[path.resolve()]} are both {path}"
+        raise ConfigError("RIL-043", text, remedy="give another name")
     if path.is_dir():
         raise ConfigError("RIL-047", f"the output {path} is a folder", remedy="name a file in it")
     if endings and path.suffix.lower() not in endings:
         allowed = " or ".join(endings)
         raise ConfigError("RIL-871", f"the output {path} has another ending", remedy=f"end it in {allowed}")
+
+
+def check_new(path: Path, but: str = "", remedy: str = "give another --output, or remove it") -> None:
+    """Refuse to overwrite a file that may be the user's own work; ``but`` says why it is taken for that."""
+    if path.exists():
+        raise ConfigError("RIL-038", f"{path} exists{but}", remedy=remedy)

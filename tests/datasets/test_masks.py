@@ -55,7 +55,7 @@ def test_traces_of_compression_are_dark():
 
 def test_a_mask_that_somebody_drew_is_not_overwritten(tmp_path):
     (tmp_path / "mask_right.png").write_bytes(b"drawn")
-    with raises("RIL-968", "mask_right.png"):
+    with raises("RIL-038", "mask_right.png"):
         mask("mockup-short", output=tmp_path)
 
 

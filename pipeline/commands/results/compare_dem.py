@@ -19,6 +19,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import (
     DemFile,
     crs_name,
+    no_ground,
     read_elevation,
     read_ortho,
     refuse_unlike_systems,
@@ -26,9 +27,9 @@ from rille.pipeline.export.read_dem import (
 )
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, named
+from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, named
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.place import register
@@ -73,8 +74,7 @@ def compare_dem(
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
     raster, facts = named(output, ".tif"), named(output, ".json")
-    if raster.resolve() in {(path / "dem.tif" if path.is_dir() else path).resolve() for path in paths}:
-        raise ConfigError("RIL-964", f"--output and a model are both {raster}", remedy="give another name")
+    check_output(raster, others={(p / "dem.tif" if p.is_dir() else p).resolve(): "a model" for p in paths})
     one, other = (read_elevation(path) for path in paths)
     place = None
     if align == "place":
@@ -92,8 +92,7 @@ def compare_dem(
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
     if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
         name = (one if one.frame == ON_PLANE else other).name
-        text = f"elevations of {name} are distances from a plane that is no ground"
-        raise InputError("RIL-966", text, remedy="run it with --set terrain.reference=ground")
+        raise no_ground(name)
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:

@@ -18,7 +18,7 @@ from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
-from rille.pipeline.export.writers import Meaning, write_raster
+from rille.pipeline.export.writers import Meaning, check_folder, write_raster
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
@@ -77,8 +77,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     folders = [lookup.find(name, runs) for name in (run, *more)]
     if len(set(folders)) < 2:
         raise ConfigError("RIL-849", "one run alone is merged with nothing", remedy="name two runs of one place")
-    if output.is_dir() and any(output.iterdir()) and not (output / "merge.json").exists():
-        raise ConfigError("RIL-965", f"{output} is not empty", remedy="give a new folder with --output")
+    check_folder(output, "merge.json")
     first, *others = (Terrain.of(folder) for folder in dict.fromkeys(folders))
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])

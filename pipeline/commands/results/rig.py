@@ -23,12 +23,22 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
+from rille.pipeline.runs.options import (
+    COMPLETE,
+    RUNS,
+    CacheFolder,
+    Output,
+    Run,
+    Runs,
+    cache_folder,
+    check_new,
+    check_output,
+)
 from rille.stages.calibration.parameter_selection import Parameter, decide
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
 from rille.stages.calibration.rig import RigParams
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.epipolar import NAMES, corrected
 from rille.stages.geometry.geometry import Rig
 
@@ -73,7 +83,7 @@ def rig(
     """
     check_output(output, ".toml")
     if output.exists() and "corrected_by_degrees" not in read_toml(output, "rig"):
-        raise ConfigError("RIL-967", f"{output} exists, and is no rig", remedy="give another --output")
+        check_new(output, ", and is no rig")
     store, matches, given = Store(cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
     folders = list(dict.fromkeys(lookup.find(name, runs) for name in (run, *more)))
     for folder in folders:

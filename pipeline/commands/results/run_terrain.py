@@ -11,7 +11,7 @@ import numpy as np
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.api import Run
-from rille.pipeline.export.read_dem import georeference_of
+from rille.pipeline.export.read_dem import georeference_of, no_ground
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
@@ -56,8 +56,7 @@ class Terrain:
             elevation, sigma, ortho = (np.asarray(terrain[key], np.float64) for key in names)
             place = georeference_of(folder)
         if vertical == REFERENCE_PLANE:
-            text = f"elevations of run {name} are distances from a plane that is no ground"
-            raise InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
+            raise no_ground(f"run {name}")
         if not np.isfinite(elevation).any():
             text = f"the terrain of run {name} has no known cell"
             raise InputError("RIL-843", text, remedy="its report says what is missing")

@@ -13,7 +13,7 @@ from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
+from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_new, check_output
 from rille.stages.core.errors import ConfigError
 
 
@@ -47,8 +47,8 @@ def init(
     findings = inspect(directory)
     path = output if output is not None else Path(name)
     check_output(path, ".toml")
-    if path.exists() and not force:
-        raise ConfigError("RIL-038", f"{path} exists", remedy="give another --output, or overwrite it by --force")
+    if not force:
+        check_new(path, remedy="give another --output, or overwrite it by --force")
     # Written whether complete or not: what is missing stands in it as comments, at its place.
     text = manifest_text(findings, _root(directory, path))
     atomic.write(path, text)

@@ -11,9 +11,9 @@ import numpy as np
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.count import count
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, Output
+from rille.pipeline.runs.options import COMPLETE, Output, check_new
 from rille.pipeline.steps import open as open_sequence
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
@@ -32,8 +32,8 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
         Folder to write to.
     """
     paths = {camera: output / f"mask_{camera}.png" for camera in CAMERAS}
-    if kept := [path for path in paths.values() if path.exists()]:
-        raise ConfigError("RIL-968", f"{kept[0]} exists", remedy="give another --output, or remove it")
+    for path in paths.values():
+        check_new(path)
     pairs = list(open_sequence(seq))
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"

@@ -118,7 +118,10 @@ def match(
         backmatch_error (pixels).
     """
     params = matcher.params()
-    _check_outputs(left, right, output, confidence)
+    taken = {left.resolve(): "an image", right.resolve(): "an image"}
+    check_output(output, ".tif", ".tiff", others=taken)
+    if confidence is not None:
+        check_output(confidence, ".tif", ".tiff", option="--confidence", others=taken | {output.resolve(): "--output"})
     # Images and the prior are checked before the matcher is imported, which takes seconds.
     images = read_grey(left), read_grey(right)
     refuse_swapped(images, f"{left} and {right}")
@@ -148,18 +151,6 @@ def match(
     figures = f"matched {100 * share:.1f} %, defined {100 * float(kept.mean()):.1f} % of {kept.size} pixels"
     print(f"{output}  {figures}{typical}")
     return COMPLETE if share >= MIN_MATCHED_SHARE else HOLES
-
-
-def _check_outputs(left: Path, right: Path, output: Path, confidence: Path | None) -> None:
-    """Refuse outputs that are folders, no TIFF, an image that is read, or one another."""
-    taken = {left.resolve(): "an image", right.resolve(): "an image"}
-    for name, path in (("--output", output), ("--confidence", confidence)):
-        if path is not None:
-            check_output(path, ".tif", ".tiff")
-            if path.resolve() in taken:
-                text = f"{name} and {taken[path.resolve()]} are both {path}"
-                raise ConfigError("RIL-043", text, remedy="give another name")
-            taken[path.resolve()] = name
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from typing import Any
 from rille.pipeline.engine import events
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.writers import check_folder
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
@@ -29,11 +30,11 @@ def export_run(form: str, run: Path, target: Path, store: Store, **thinning: flo
     Raises
     ------
     InputError
-        The run has nothing that the form shows, its artifacts are gone from the cache, or ``target`` is a folder that
-        is not empty.
+        The run has nothing that the form shows, or its artifacts are gone from the cache.
+    ConfigError
+        ``target`` is a folder that is not empty.
     """
-    if target.is_dir() and any(target.iterdir()):
-        raise InputError("RIL-607", f"{target} is not empty", remedy="give a new folder with --output")
+    check_folder(target)
     write_run = import_module(f"rille.pipeline.export.programs.{WRITERS.get(form, form)}").write_run
     with atomic.replacing(target) as temporary:
         words: str = write_run(temporary, RunArtifacts(run, store), **thinning)

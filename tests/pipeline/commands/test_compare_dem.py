@@ -178,8 +178,8 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert f"no known cell among {z.size}" in refused(capsys, empty, run)
     assert "cannot be read as a raster" in refused(capsys, tmp_path / "text.tif", run)
     assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
-    assert "RIL-964" in refused(capsys, run, away, "-o", tmp_path / "away")
-    assert "RIL-964" in refused(capsys, run, away, "-o", run / "dem")
+    assert "RIL-043" in refused(capsys, run, away, "-o", tmp_path / "away")
+    assert "RIL-043" in refused(capsys, run, away, "-o", run / "dem")
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
 
@@ -189,7 +189,7 @@ def test_distances_from_a_plane_are_not_compared_with_ground(
 ) -> None:
     run, wall = finished(tmp_path / "run"), finished(tmp_path / "wall")
     write_raster(wall / "dem.tif", {"elevation": elevation()}, LATTICE, Meaning("m", tags={"frame": ON_PLANE}))
-    assert "RIL-966" in refused(capsys, run, wall)
+    assert "RIL-842" in refused(capsys, run, wall)
     assert compare(wall, wall, output=tmp_path / "out") == 0
 
 

@@ -100,7 +100,7 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
     ):
         with raises(code):
             merge(str(one), str(two), output=tmp_path / "out")
-    with raises("RIL-965"):
+    with raises("RIL-607"):
         merge(str(a), str(b), output=coarse)
     (tmp_path / "file").write_text("")
     with pytest.raises(FileExistsError, match="file"):

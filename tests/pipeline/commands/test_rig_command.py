@@ -49,7 +49,7 @@ def test_a_rig_that_moved_between_runs_is_said():
 
 def test_a_manifest_is_not_overwritten_by_a_rig(tmp_path):
     (tmp_path / "rover.toml").write_text('[images]\nleft = "left/*.png"\n')
-    with raises("RIL-967"):
+    with raises("RIL-038"):
         rig("latest", output=tmp_path / "rover.toml")
 
 
