@@ -90,7 +90,7 @@ def image_pairs(frames: int) -> list[tuple[int, int]]:
 
 def colmap_rig(rig: Rig) -> tuple[list[Any], Any]:
     """Left and right camera as COLMAP has them, without lens distortion, and their rig."""
-    from rille.stages.numeric.colmap import pycolmap
+    from rille.stages.geometry.colmap import pycolmap
 
     cameras = []
     for number, camera in ((1, rig.left), (2, rig.right)):
@@ -110,7 +110,7 @@ def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verifi
 
     ``features`` of stage ``features``, left and right in turn.
     """
-    from rille.stages.numeric.colmap import pycolmap
+    from rille.stages.geometry.colmap import pycolmap
 
     cameras, body = colmap_rig(rig)
     for camera in cameras:
@@ -194,7 +194,7 @@ def _models(database: Any, starts: Mapping[int, int]) -> list[Any]:
 
 def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     """Incremental mapping from two images on, with the rig and all intrinsics held."""
-    from rille.stages.numeric.colmap import pycolmap
+    from rille.stages.geometry.colmap import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
     # With more threads the order of sums, and so the result, differs from run to run.
@@ -241,7 +241,7 @@ def crosscheck_stage(
     params: CrosscheckParams, left: Sequence[Bundle], right: Sequence[Bundle], *, frames: Sequence[int], rig: Rig
 ) -> Bundle[WindowFacts]:
     """Poses of a window of frames by COLMAP, for comparison."""
-    from rille.stages.numeric.colmap import pycolmap
+    from rille.stages.geometry.colmap import pycolmap
 
     pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
     features = list(itertools.chain.from_iterable(zip(left, right, strict=True)))

@@ -23,7 +23,7 @@ from rille.stages.hfvm.native.reference import exhaustive
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
-from rille.stages.numeric.threads import side_by_side
+from rille.stages.hfvm.threads import side_by_side
 
 
 @njit(cache=True, nogil=True)

@@ -91,7 +91,7 @@ def build(
     names : image name of each frame, written as ``left/NAME`` and ``right/NAME``.
     images : left images of key frames, for the colours of the points.
     """
-    from rille.stages.numeric.colmap import pycolmap
+    from rille.stages.geometry.colmap import pycolmap
 
     poses = {
         int(f): RigidTransform.from_matrix(pose)

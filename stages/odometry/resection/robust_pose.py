@@ -35,8 +35,8 @@ from pydantic import Field
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
+from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.numeric.colmap import pycolmap
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (

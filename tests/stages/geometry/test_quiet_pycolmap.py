@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-PROGRAM = "from rille.stages.numeric.colmap import pycolmap; import os, signal; os.kill(os.getpid(), signal.SIGTERM)"
+PROGRAM = "from rille.stages.geometry.colmap import pycolmap; import os, signal; os.kill(os.getpid(), signal.SIGTERM)"
 
 
 def test_a_program_with_pycolmap_is_ended_without_a_word():
