@@ -15,6 +15,9 @@ from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
+MAX_BLANK_SHARE = 0.5
+"""Share of pixels without texture from which on that is said, however well the others match."""
+
 WHY_NOT = (
     (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
     (Validity.OUT_OF_IMAGE, "have their match outside the right image"),
@@ -27,40 +30,70 @@ WHY_NOT = (
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:
     """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``StereoMatches``.
 
-    ``closely``: compare samples of the images, too, which takes half a second.
+    One that explains all others stands alone. ``closely``: compare samples of the images, too, which takes half a
+    second.
     """
+    ok = matched_back(result.validity, result.backmatch_error)
+    # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
+    alike = left.shape == right.shape
+    explains_all = _unmatched(result) or _without_texture(result) or (_exchanged(result, ok) if alike else "")
+    if explains_all:
+        yield explains_all
+    elif closely:
+        yield from _wrong_matches(result, left, right, ok)
+
+
+def _unmatched(result: Any) -> str:
+    """That hardly a pixel matches, and the two most frequent reasons.
+
+    They tell a user whether the light, the order or the scene is at fault.
+    """
+    share = float(matched(result.validity).mean())
+    if share >= MIN_MATCHED_SHARE:
+        return ""
+    shares = sorted(((float(has(result.validity, bit).mean()), words) for bit, words in WHY_NOT), reverse=True)
+    frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
+    text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
+    return warning("RIL-700", text)
+
+
+def _without_texture(result: Any) -> str:
+    share = float(has(result.validity, Validity.NO_TEXTURE).mean())
+    text = f"{100 * share:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
+    return warning("RIL-701", text) if share > MAX_BLANK_SHARE else ""
+
+
+def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
+    """That displacements of the matches that are ``ok`` are those of a left image taken for the right one."""
     from rille.stages.hfvm import given
 
-    share, blank = float(matched(result.validity).mean()), float(has(result.validity, Validity.NO_TEXTURE).mean())
-    ok = matched_back(result.validity, result.backmatch_error)
-    if share < MIN_MATCHED_SHARE:
-        # The two most frequent reasons: they tell a user whether the light, the order or the scene is at fault.
-        shares = sorted(((float(has(result.validity, bit).mean()), words) for bit, words in WHY_NOT), reverse=True)
-        frequent = ", ".join(f"{100 * s:.0f} % {words}" for s, words in shares[:2] if s >= 0.005)
-        text = f"only {100 * share:.1f} % of the pixels match ({frequent}): do both images show one scene in one light?"
-        yield warning("RIL-700", text)
-    elif blank > 0.5:  # however well the others match
-        text = f"{100 * blank:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
-        yield warning("RIL-701", text)
-    # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
-    elif left.shape == right.shape and given.swapped(result.column_disparity, result.row_disparity, ok):
-        median = float(np.median(result.column_disparity[ok]))
+    if not given.swapped(result.column_disparity, result.row_disparity, ok):
+        return ""
+    median = float(np.median(result.column_disparity[ok]))
+    text = (
+        f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
+        "a pair of a left and a right camera, give them in the other order"
+    )
+    return warning("RIL-702", text)
+
+
+def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any], ok: NDArray[np.bool_]) -> Iterator[str]:
+    """That matches which are ``ok`` contradict each other, or could as well be others."""
+    from rille.stages.hfvm import given
+
+    judged = given.judge(left, right, result, ok)
+    if judged is None:
+        return
+    on_lines, repeated = judged
+    if on_lines < given.MIN_RIGID_SHARE:
         text = (
-            f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
-            "a pair of a left and a right camera, give them in the other order"
+            f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
+            "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
         )
-        yield warning("RIL-702", text)
-    elif closely and (judged := given.judge(left, right, result, ok)) is not None:
-        on_lines, repeated = judged
-        if on_lines < given.MIN_RIGID_SHARE:
-            text = (
-                f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
-                "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
-            )
-            yield warning("RIL-703", text)
-        if repeated > given.MAX_REPEATED_SHARE:
-            text = (
-                f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
-                "pattern they may be off by a period: look at them first"
-            )
-            yield warning("RIL-704", text)
+        yield warning("RIL-703", text)
+    if repeated > given.MAX_REPEATED_SHARE:
+        text = (
+            f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
+            "pattern they may be off by a period: look at them first"
+        )
+        yield warning("RIL-704", text)
