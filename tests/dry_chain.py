@@ -116,8 +116,8 @@ def laid_out(root: Path) -> Iterator[Chain]:
     """A chain of which a task that is to be computed again leads to what its label led to before."""
     chain = Chain(root)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(provenance.Known, "reason", lambda *_: "")
-        patch.setattr(provenance.Known, "latest", lambda known, store, stage, label: chain.earlier(label))
+        patch.setattr(provenance.History, "why_missed", lambda *_: "")
+        patch.setattr(provenance.History, "latest", lambda history, handle: chain.earlier(handle.label))
         yield chain
 
 

@@ -27,20 +27,18 @@ class Ledger:
 
     def write(self, handle: Handle) -> None:
         """Write the outcome of a node: sources of its inputs, reason of the cache miss, time and memory."""
-        row: dict[str, Any] = {"label": handle.label, "stage": handle.stage, "status": handle.status}
-        if handle.inputs:
-            row["inputs"] = each(lambda h: h.label, handle.inputs)
-        if handle.reason:
-            row["reason"] = handle.reason
-        if handle.key:
-            row["key"] = handle.key
-        if handle.ref is not None:
-            row["digest"] = handle.ref.digest
-        if handle.status == "computed":
-            row |= _took(handle)
-        if handle.error is not None:
-            row["error"] = {"type": type(handle.error).__name__, "message": str(handle.error)}
-        self._line(row)
+        row: dict[str, Any] = {
+            "label": handle.label,
+            "stage": handle.stage,
+            "status": handle.status,
+            "inputs": each(lambda h: h.label, handle.inputs),
+            "reason": handle.reason,
+            "key": handle.key,
+            "digest": handle.ref and handle.ref.digest,
+            "error": handle.error and {"type": type(handle.error).__name__, "message": str(handle.error)},
+        }
+        took = _took(handle) if handle.status == "computed" else {}
+        self._line({name: value for name, value in row.items() if value} | took)
 
     def note(self, label: str, status: str, reason: str) -> None:
         """A line for what is no node: an expansion that could not be made."""

@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from rille.stages.core.errors import RilleError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-
-
-@contextmanager
-def reported(code: str, words: str, *, remedy: str, kind: type[RilleError] = RilleError) -> Iterator[None]:
-    """Raise an error of the system as one of Rille: ``words``, the system's reason and the remedy."""
-    try:
-        yield
-    except OSError as error:
-        raise kind(code, f"{words}: {error.strerror or error}", remedy=remedy) from error
 
 
 def translated(error: BaseException) -> RilleError | None:

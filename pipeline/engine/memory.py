@@ -51,11 +51,11 @@ def parse(text: str) -> int:
 
 def words(amount: float) -> str:
     """``412 MB``, ``1.2 GB``, ``35 kB``."""
-    for limit, unit, digits in ((999.5e6, 1e9, 1), (99.5e3, 1e6, 0), (0, 1e3, 0)):
-        if amount >= limit:
-            name = {1e9: "GB", 1e6: "MB", 1e3: "kB"}[unit]
-            return f"{amount / unit:.{1 if unit == 1e6 and amount < 9.95e6 else digits}f} {name}"
-    return "0 kB"
+    if amount >= 999.5e6:
+        return f"{amount / 1e9:.1f} GB"
+    if amount >= 99.5e3:
+        return f"{amount / 1e6:.{1 if amount < 9.95e6 else 0}f} MB"
+    return f"{amount / 1e3:.0f} kB"
 
 
 def total() -> int:
@@ -79,19 +79,20 @@ def resident() -> int:
 
 @dataclass(frozen=True)
 class Budget:
-    """Bytes that a run may take, ``limit``, of which this process holds ``own``."""
+    """Bytes that a run may take, ``limit``, of which this process holds ``own``; with ``jobs`` workers at most."""
 
     limit: float
     own: float
+    jobs: int = 1
 
     @property
     def alone(self) -> float:
         """Memory for a task on the only worker, bytes."""
         return max(0.0, self.limit - self.own - WORKER_BYTES)
 
-    def workers(self, jobs: int, largest: float) -> int:
-        """Number of workers, of ``jobs`` at most, each of which may run the ``largest`` task [bytes] at once."""
-        return int(max(1, min(jobs, (self.limit - self.own) // (WORKER_BYTES + largest))))
+    def workers(self, largest: float) -> int:
+        """Number of workers each of which may run the ``largest`` task [bytes] at once."""
+        return int(max(1, min(self.jobs, (self.limit - self.own) // (WORKER_BYTES + largest))))
 
     def refusal(self, handle: Handle, estimate: float) -> MemoryRefusedError | None:
         """Why a task cannot run here at all, if so."""
@@ -107,18 +108,19 @@ class Budget:
         )
 
 
-def budget(executor: Any, limit: float | None) -> Budget:
-    """What a run may take: ``limit`` bytes if given; on a cluster of others as much as it likes, else what is free."""
+def budget(executor: Any, limit: float | None, jobs: int | None) -> Budget:
+    """What a run may take.
+
+    Parameters
+    ----------
+    limit : bytes; None: on a cluster of others as much as it likes, else what is free.
+    jobs : workers; None: one a core. Within the program (``inline``) there is one.
+    """
     own = float(resident())
-    if limit is not None:
-        return Budget(float(limit), own)
-    # Part of what is free that a run takes by itself: page cache for its files, and others that grow, need the rest
-    return Budget(own + 0.9 * free() if executor in ("dask", "inline") else math.inf, own)
-
-
-def most_workers(executor: Any, asked: int | None) -> int:
-    """Number of workers that memory may reduce: as many as asked for, or one a core; one within the program."""
-    return 1 if executor == "inline" else asked or cores()
+    if limit is None:
+        # The page cache of the run's files, and other programs that grow, need the rest of what is free.
+        limit = own + 0.9 * free() if executor in ("dask", "inline") else math.inf
+    return Budget(float(limit), own, 1 if executor == "inline" else jobs or cores())
 
 
 class Estimates:

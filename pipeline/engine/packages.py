@@ -74,14 +74,12 @@ def _version(name: str) -> tuple[str, str]:
     for distribution in KNOWN.get(name, (name,)):
         with suppress(importlib.metadata.PackageNotFoundError):
             return distribution, version(distribution)
-    for distribution in _distributions().get(name, ()):
+    for distribution in _distributions().get(name, []):
         return distribution, version(distribution)
     raise MissingPackageError("RIL-530", f"package {name} is not installed", remedy="run `make install`")
 
 
-@cache
-def _distributions() -> dict[str, list[str]]:
-    return {name: list(given) for name, given in importlib.metadata.packages_distributions().items()}
+_distributions = cache(importlib.metadata.packages_distributions)
 
 
 def _kind(distribution: str) -> str:

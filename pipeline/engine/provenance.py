@@ -33,18 +33,17 @@ Keys = dict[str, list[str]]
 _KEYS = TypeAdapter(Keys)
 
 
-class Known:
-    """The latest keys of each task of a sequence.
+class History:
+    """The latest keys of each task of a sequence in earlier runs.
 
     Parameters
     ----------
-    hints : the sequence's folder of hints.
     choice : names the choice of frames. What is to be laid out follows results of the same choice alone; a reason may
         come from another one, where this one has none.
     """
 
-    def __init__(self, hints: Path, choice: str) -> None:
-        self._path = hints / f"keys-{choice}.json"
+    def __init__(self, store: Store, sequence: str, choice: str) -> None:
+        self._store, self._path = store, store.hints(sequence) / f"keys-{choice}.json"
 
     @cached_property
     def _own(self) -> Keys:
@@ -58,13 +57,13 @@ class Known:
             return [_read(p) for p in sorted(found, key=os.path.getmtime, reverse=True)]
         return []
 
-    def reason(self, store: Store, stage: str, label: str, key: str, recipe: Mapping[str, Any]) -> str:
-        """Why ``key`` is missed, in words: ``params.cell_size 0.02 -> 0.01``, ``never computed`` ..."""
-        name = _name(stage, label)
+    def why_missed(self, handle: Handle, recipe: Mapping[str, Any]) -> str:
+        """Why there is no artifact of a key, in words: ``params.cell_size 0.02 -> 0.01``, ``never computed`` ..."""
+        name = _name(handle)
         keys = self._own.get(name) or next((k[name] for k in self._others if name in k), [])
-        if key in keys:
+        if handle.key in keys:
             return "was computed before, its artifact is gone or damaged"
-        earlier = [m["provenance"] for k in keys if (m := store.manifest(stage, k)) is not None]
+        earlier = [m["provenance"] for k in keys if (m := self._store.manifest(handle.stage, k)) is not None]
         if not earlier:
             return "never computed" if not keys else "earlier artifacts are gone"
         now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
@@ -76,14 +75,15 @@ class Known:
         shown = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
         return "; ".join(shown) or "the key has another format"
 
-    def latest(self, store: Store, stage: str, label: str) -> Ref | None:
+    def latest(self, handle: Handle) -> Ref | None:
         """The latest artifact of a stage and label that is still there, whatever it was made from."""
-        return next((ref for k in self._own.get(_name(stage, label), []) if (ref := store.lookup(stage, k))), None)
+        keys = self._own.get(_name(handle), [])
+        return next((ref for k in keys if (ref := self._store.lookup(handle.stage, k))), None)
 
     def save(self, nodes: Iterable[Handle]) -> None:
         """Note what a run used."""
         known = _read(self._path)
-        used = {_name(h.stage, h.label): h.key for h in nodes if h.ref is not None}
+        used = {_name(h): h.key for h in nodes if h.ref is not None}
         if all(known.get(name, [""])[0] == key for name, key in used.items()):
             return
         # Earlier keys remembered per label: enough for a user who goes back and forth between a few settings
@@ -96,15 +96,9 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     found = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
     found += _inputs(then.get("inputs", {}), now["inputs"])
     old, new = then.get("code", {}), now["code"]
-    found += [
-        f"code: {m.replace('.', '/')}.py {_change(m, old, new)}"
-        for m in sorted({*old, *new})
-        if old.get(m) != new.get(m)
-    ]
+    found += [f"code: {name.replace('.', '/')}.py {_change(name, old, new)}" for name in _unequal(old, new)]
     old, new = then.get("env", {}), now["env"]
-    found += [
-        f"{d} {old.get(d, 'none')} -> {new.get(d, 'none')}" for d in sorted({*old, *new}) if old.get(d) != new.get(d)
-    ]
+    found += [f"{name} {old.get(name, 'none')} -> {new.get(name, 'none')}" for name in _unequal(old, new)]
     for what in ("version", "format"):
         found += _values(what, then.get(what), now[what])
     return found
@@ -121,26 +115,27 @@ def _values(where: str, old: Any, new: Any) -> list[str]:
 
 def _inputs(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     found = []
-    for port in sorted({*old, *new}):
-        was, now = old.get(port), new.get(port)
-        if was == now:
-            continue
-        if isinstance(was, list) and isinstance(now, list) and len(was) == len(now):
-            changed = sum(a != b for a, b in zip(was, now, strict=True))
-            found.append(f"input {port} changed ({changed} of {len(now)})")
-        elif isinstance(was, list) and isinstance(now, list):
-            found.append(f"input {port} has {len(now)} instead of {len(was)}")
-        else:
-            found.append(f"input {port} {'added' if was is None else 'dropped' if now is None else 'changed'}")
+    for port in _unequal(old, new):
+        was, now, change = old.get(port), new.get(port), _change(port, old, new)
+        if isinstance(was, list) and isinstance(now, list):
+            changed = sum(a != b for a, b in zip(was, now, strict=False))
+            same_number = len(was) == len(now)
+            change = f"changed ({changed} of {len(now)})" if same_number else f"has {len(now)} instead of {len(was)}"
+        found.append(f"input {port} {change}")
     return found
 
 
-def _change(name: str, old: Mapping[str, str], new: Mapping[str, str]) -> str:
+def _unequal(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Names of what is not the same in both, or in one alone."""
+    return sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
+
+
+def _change(name: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     return "is new" if name not in old else "is gone" if name not in new else "changed"
 
 
-def _name(stage: str, label: str) -> str:
-    return f"{stage} {label}"
+def _name(handle: Handle) -> str:
+    return f"{handle.stage} {handle.label}"
 
 
 def _read(path: Path) -> Keys:

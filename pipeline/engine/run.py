@@ -197,7 +197,6 @@ class _Run:
         self.workers: Workers | None = None
         self.budget = memory.Budget(math.inf, 0.0)
         self.estimates, self.largest = memory.Estimates(), 0.0
-        self.jobs = memory.most_workers(options.executor, options.jobs)
         self.stopped = ""
         self.taken = 0
         self.again: list[int] = []
@@ -207,7 +206,7 @@ class _Run:
         self.alone: set[int] = set()
         self.heals: Counter[int] = Counter()
         self.before: dict[int, str] = {}
-        self.known = provenance.Known(store.hints(graph.sequence), graph.choice)
+        self.history = provenance.History(store, graph.sequence, graph.choice)
         self.seen = 0
         self._ask()
 
@@ -228,7 +227,7 @@ class _Run:
         finally:
             self._count()
             if not self.dry:
-                self.known.save(self.graph.nodes)
+                self.history.save(self.graph.nodes)
             self.result.seconds = time.perf_counter() - begin
             # Without "ok" a ledger is that of a run which did not come to its end.
             ended = {} if self.result.interrupted else {"ok": self.result.ok}
@@ -322,17 +321,14 @@ class _Run:
             if handle.index not in self.before:
                 self._explain(handle, refs)
         if self.dry:
-            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
+            handle.earlier = self.history.latest(handle)
             self._resolve(handle, "planned")
         else:
             self._submit(handle, upstream)
 
     def _explain(self, handle: Handle, refs: Refs) -> None:
-        if handle.stage in self.force:
-            handle.reason = "forced"
-        else:
-            made = recipe(handle.spec, refs)
-            handle.reason = self.known.reason(self.store, handle.stage, handle.label, handle.key, made)
+        forced = handle.stage in self.force
+        handle.reason = "forced" if forced else self.history.why_missed(handle, recipe(handle.spec, refs))
 
     def _submit(self, handle: Handle, upstream: list[Handle]) -> None:
         needs = self.estimates.task(handle)
@@ -343,7 +339,7 @@ class _Run:
         if needs > self.largest:
             self.largest = needs
             if self.workers is not None:
-                self.workers.scale(self.budget.workers(self.jobs, needs))
+                self.workers.scale(self.budget.workers(needs))
         given, force = each(_given, handle.inputs), handle.stage in self.force
         self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
@@ -358,13 +354,13 @@ class _Run:
         """
         kind = self.options.executor
         check(kind, self.options.jobs)
-        self.budget = memory.budget(kind, self.options.memory_limit)
+        self.budget = memory.budget(kind, self.options.memory_limit, self.options.jobs)
         for handle in self.in_flight.values():
             if (refused := self.budget.refusal(handle, self.estimates.task(handle))) is not None:
                 raise refused.at(handle.label)
         # Before the workers start: a full or read-only disk should not cost that time.
         self.store.writable()
-        jobs = self.budget.workers(self.jobs, self.largest)
+        jobs = self.budget.workers(self.largest)
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
         self.result.workers_started = True
@@ -386,7 +382,7 @@ class _Run:
         handle.reason = f"input {missing.label} is to be computed" if planned else f"{missing.label} {fate}"
         handle.cause = missing.label
         if planned:
-            handle.earlier = self.known.latest(self.store, handle.stage, handle.label)
+            handle.earlier = self.history.latest(handle)
         self._resolve(handle, "planned" if planned else "skipped")
 
     # -- what comes back ----------------------------------------------------------------------------------------

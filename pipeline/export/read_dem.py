@@ -181,7 +181,7 @@ def read_raster(path: Path) -> DemFile:
         It cannot be read, has no geotransform, or has another unit.
     """
     with opened_raster(path) as file:
-        _check_cells(path, file.shape, path.stat().st_size)
+        _check_cells(path, file.shape)
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         if "red" in {band.name for band in file.colorinterp}:
             remedy = "give an elevation model; rille localize takes images by --ortho"
@@ -210,7 +210,7 @@ def read_ortho(path: Path) -> tuple[Grid, str]:
         It cannot be read, has no geotransform, no known cell, or is not in metres.
     """
     with opened_raster(path) as file:
-        _check_cells(path, file.shape, path.stat().st_size)
+        _check_cells(path, file.shape)
         grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
         t, crs = file.transform, file.crs
     wkt = _checked_system(path, t, crs)
@@ -245,9 +245,10 @@ def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.
     return np.ascontiguousarray(column), np.ascontiguousarray(row)
 
 
-def _check_cells(path: Path, shape: tuple[int, ...], stored: int) -> None:
-    """Refuse more cells than there is memory for, or than so many ``stored`` bytes can hold."""
-    # Memory that a cell takes until it is read, and compared or exported
+def _check_cells(path: Path, shape: tuple[int, ...]) -> None:
+    """Refuse more cells than there is memory for, or than a file of that size can hold."""
+    stored = path.stat().st_size
+    # A cell takes 100 bytes until it is read, and compared or exported.
     most = min(MAX_CELLS, free() // 100, max(4_000_000, 50 * stored))
     if math.prod(shape) > most:
         size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"

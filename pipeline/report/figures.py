@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from rille.pipeline.export import ranges
-from rille.pipeline.report import canvas
+from rille.pipeline.report import canvas, ranges
 from rille.pipeline.report.canvas import Panel
 from rille.stages.core.arrays import Floats
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.pipeline.export import colour, ranges
+from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
-from rille.pipeline.report import canvas, figures, gather, strips, tables, terrain_map
+from rille.pipeline.report import canvas, figures, gather, ranges, strips, tables, terrain_map
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export import artifacts, ranges
-from rille.pipeline.report import canvas, gather
+from rille.pipeline.export import artifacts
+from rille.pipeline.report import canvas, gather, ranges
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.words import metres

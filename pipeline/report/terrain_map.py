@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export import colour, ranges
-from rille.pipeline.report import canvas, gather, strips
+from rille.pipeline.export import colour
+from rille.pipeline.report import canvas, gather, ranges, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.strips import StripLine

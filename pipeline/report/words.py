@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.export import ranges
+from rille.pipeline.report import ranges
 
 SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
 """Unit for small values: its name, the factor and the bound below which it is used."""
@@ -32,15 +32,16 @@ def quantity(value: Any, unit: str) -> str:
     """Value with its unit, small lengths and areas in mm and cm²; a dash where there is none (None, NaN)."""
     if value is None or value != value:
         return "–"
-    if isinstance(value, float) and unit in SMALL and abs(value) < 1e-9:
-        value = 0  # rounding
-    if isinstance(value, int | float) and unit in SMALL and value != 0 and abs(value) < SMALL[unit][2]:
-        unit, factor, _ = SMALL[unit]
-        value = value * factor
-    elif isinstance(value, int | float) and unit == "deg":
-        return f"{number(value)}°"
-    elif isinstance(value, int | float) and unit == "1":
-        return f"{number(100 * value)} %"
+    if isinstance(value, int | float):
+        if unit == "deg":
+            return f"{number(value)}°"
+        if unit == "1":
+            return f"{number(100 * value)} %"
+        if unit in SMALL and abs(value) < 1e-9:
+            value = 0  # rounding
+        elif unit in SMALL and abs(value) < SMALL[unit][2]:
+            unit, factor, _ = SMALL[unit]
+            value = value * factor
     if value == 1 and unit in ("frames", "cells"):
         unit = unit[:-1]
     return f"{number(value)} {unit}".strip()

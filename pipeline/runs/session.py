@@ -11,7 +11,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import chain, count
@@ -24,7 +23,6 @@ from rille.datasets.registry import open_sequence
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
-from rille.pipeline.engine.failures import reported
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
@@ -111,7 +109,7 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
 
 
 def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
-    """The same for a run: what it cannot use is refused, of what is suspicious but possible ``warn`` is told."""
+    """As :func:`settings`, for a run: refuse what it cannot use; ``warn`` takes what is suspicious but possible."""
     # Before anything is read or written.
     stages = configuration.stage_names() if options.force else set()
     for name in sorted(options.force - stages):
@@ -192,9 +190,7 @@ def perform(
     kept : list of the workers that a run leaves to the next one; whoever gives it ends them.
     warn : takes warnings, one line each: those of the input before anything is computed.
     """
-    # They import matplotlib, which a wrong option should not have to wait for.
-    from rille.pipeline.report.delivery import is_complete, left_out
-    from rille.pipeline.runs import run_files
+    from rille.pipeline.runs import run_files  # imports matplotlib, which a wrong option should not have to wait for
 
     opened = _open(sequence, options, verb, warn)
     made: run_files.Made = {}
@@ -209,11 +205,18 @@ def perform(
     for line in dict.fromkeys((*suspicious, *report["warnings"])):
         if line not in opened.view.sequence.warnings:
             warn(line)
-    total, missing, lines, arrived = result.total(), report["missing"], [], COMPLETE
+    return _summed_up(opened, result, report["missing"])
+
+
+def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:
+    """What a run came to, in its closing lines; ``missing`` as its report lists it."""
+    from rille.pipeline.report.delivery import is_complete, left_out
+
+    total, lines, arrived = result.total(), [], True
     if opened.drive is not None:
         outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
         lines.append(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
-        arrived = COMPLETE if outcome[0] == "goal" else HOLES
+        arrived = outcome[0] == "goal"
     page = opened.folder / "report.html"
     lines.append(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
     if opened.view.part:
@@ -223,13 +226,14 @@ def perform(
     if not result.ok:
         ledger = opened.folder / LEDGER
         complaints.append(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}")
+    done = result.ok and arrived
     # A drive that ended early did not come to the tasks that would have read all parameters.
-    idle = list(_idle(opened)) if result.ok and arrived == COMPLETE else []
-    whole = result.ok and arrived == COMPLETE and is_complete(missing) and not idle
+    idle = list(_idle(opened)) if done else []
+    whole = done and is_complete(missing) and not idle
     return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
 
 
-def _open(name: str | Sequence, options: Options, verb: str, warn: Callable[[str], None] = warn) -> _Opened:
+def _open(name: str | Sequence, options: Options, verb: str, warn: Callable[[str], None]) -> _Opened:
     """Read the input and lay the run out."""
     started = datetime.now(UTC)
     settled = settings_of_run(name, options, warn)
@@ -327,10 +331,14 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
     # Two runs of one plan within a second: mkdir decides which of them has the name.
     for suffix in chain([""], (f"-{number}" for number in count(2))):
         folder = parent / (name + suffix)
-        reported_as = reported("RIL-061", f"cannot make {folder}", remedy="choose another --runs folder")
-        with reported_as, suppress(FileExistsError):
+        try:
             folder.mkdir(parents=True)
             break
+        except FileExistsError:
+            continue
+        except OSError as error:
+            text = f"cannot make {folder}: {error.strerror}"
+            raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
 
 

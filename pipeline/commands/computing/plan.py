@@ -72,28 +72,26 @@ def plan(
     if lost:
         text = f"{unread.values(lost, config)}: no task of this run reads it"
         raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
-    budget = memory.budget(options.executor, memory_limit(options))
-    jobs = memory.most_workers(options.executor, options.jobs)
-    largest = max((needs for _, needs in memory.Estimates().planned(graph)), default=0.0)
-    lines = describe(graph, result, budget.workers(jobs, largest), verbose=verbose)
+    budget = memory.budget(options.executor, memory_limit(options), options.jobs)
+    planned = memory.Estimates().planned(graph)
+    workers = budget.workers(max((needs for _, needs in planned), default=0.0))
     # The refusal comes last, so that the table stands above it and shows which task it is.
-    for line in chain(lines, needs(graph, budget, jobs)):
+    for line in chain(describe(graph, result, workers, verbose=verbose), needs(planned, budget)):
         print(line)
     return COMPLETE
 
 
-def needs(graph: Graph, budget: memory.Budget, jobs: int) -> Iterable[str]:
-    """A line on the memory of what is to be computed; nothing where nothing is.
+def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterable[str]:
+    """A line on the memory [bytes] of what is to be computed; nothing where nothing is.
 
     Raises
     ------
     MemoryRefusedError
         A task does not fit even alone.
     """
-    planned = memory.Estimates().planned(graph)
     if planned:
         handle, largest = max(planned, key=lambda task: task[1])
-        room = f"room for {count(budget.workers(jobs, largest), 'worker')} in {words(budget.limit)}"
+        room = f"room for {count(budget.workers(largest), 'worker')} in {words(budget.limit)}"
         yield f"memory: the largest task, {handle.label}, is estimated to need {words(largest)}; {room}"
         if (refused := budget.refusal(handle, largest)) is not None:
             raise refused.at(handle.label)

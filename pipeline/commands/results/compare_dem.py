@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -78,16 +78,7 @@ def compare_dem(
     one, other = (read_elevation(path) for path in paths)
     place = None
     if align == "place":
-        files = [path for path in paths if not path.is_dir()]
-        if files:
-            text = f"{files[0]} is no run: it has no ortho image"
-            raise InputError("RIL-908", text, remedy="leave --align place out")
-        image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
-        placed = register((image, reference), (one.grid, other.grid))
-        x, y, heading = from_above(placed.pose)
-        cos, sin = math.cos(heading), math.sin(heading)
-        motion = np.array([[cos, -sin, x], [sin, cos, y]])
-        place = {"motion_of_a": motion.tolist(), "by": placed.by}
+        motion, place = _placed(paths, one, other)
         one, align = moved(one, motion), "rigid"
     refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
     if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
@@ -109,6 +100,20 @@ def compare_dem(
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
     print(f"{raster}  {facts}")
     return COMPLETE
+
+
+def _placed(paths: Sequence[Path], one: DemFile, other: DemFile) -> tuple[Floats, dict[str, Any]]:
+    """Motion (2, 3) of x, y that lays the terrain of a run on that of another, and its facts for the JSON file."""
+    files = [path for path in paths if not path.is_dir()]
+    if files:
+        text = f"{files[0]} is no run: it has no ortho image"
+        raise InputError("RIL-908", text, remedy="leave --align place out")
+    image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
+    placed = register((image, reference), (one.grid, other.grid))
+    x, y, heading = from_above(placed.pose)
+    cos, sin = math.cos(heading), math.sin(heading)
+    motion = np.array([[cos, -sin, x], [sin, cos, y]])
+    return motion, {"motion_of_a": motion.tolist(), "by": placed.by}
 
 
 def moved(dem: DemFile, motion: Floats) -> DemFile:
@@ -137,38 +142,26 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         "resampling": how,
         "warnings": [*missing_crs, *a.warnings, *b.warnings],
     }
-    alignment = None
+    pose = None
     if align != "none":
         figures["before_alignment"] = evaluation.figures(evaluation.errors(on_a, on_b))
         alignment = evaluation.align(on_a, on_b, align)  # type: ignore[arg-type]
-        figures["alignment"] = _alignment(alignment, align)
-    error = evaluation.errors(on_a, on_b, None if alignment is None else alignment.pose)
+        figures["alignment"], pose = _alignment(alignment, align), alignment.pose
+    error = evaluation.errors(on_a, on_b, pose)
     figures["figures"] = evaluation.figures(error)
-    compared, known = int(np.isfinite(error).sum()), np.isfinite(on_b.values)
-    if not compared:
+    if not np.isfinite(error).any():
         text = "no cell is left that both know"
         raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
-    within = int((known & _within(on_b, a)).sum())
-    figures["completeness"] = {
-        "of_b": min(compared / known.sum(), 1.0),
-        "of_b_within_a": min(compared / max(within, 1), 1.0),
-        "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
-        "within the outline of A",
-    }
+    figures["completeness"] = _completeness(error, on_b, a)
     factor = evaluation.relief_factor(on_a, on_b)
     if not 1.0 / MAX_RELIEF_FACTOR < factor < MAX_RELIEF_FACTOR:
-        text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: is one of them in another unit"
-        figures["warnings"].append(warning("RIL-963", f"{text}{', or of depths' if factor < 0.0 else ''}?"))
+        doubt = f"is one of them in another unit{', or of depths' if factor < 0.0 else ''}?"
+        text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: {doubt}"
+        figures["warnings"].append(warning("RIL-963", text))
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
     edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
     figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}
-    distance, unit = _range(on_b, a, b)
-    bins = []
-    if distance is not None:
-        far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
-        # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
-        bins = evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))
-    figures["by_range"] = {"unit": unit, "bins": bins}
+    figures["by_range"] = _by_range(error, on_b, a, b)
     return figures, error, on_b
 
 
@@ -225,21 +218,31 @@ def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
     }
 
 
-def _within(target: Grid, a: DemFile) -> NDArray[np.bool_]:
-    """Target cells (rows, cols) whose centres lie in the outline of A."""
-    index = a.grid.index(target.centres())
-    return np.asarray(((index >= -0.5) & (index <= np.array(a.grid.values.shape) - 0.5)).all(axis=-1))
+def _completeness(error: Floats, on_b: Grid, a: DemFile) -> dict[str, Any]:
+    """Share of the cells of B that could be compared: of all, and of those whose centres lie in the outline of A."""
+    compared, known, index = int(np.isfinite(error).sum()), np.isfinite(on_b.values), a.grid.index(on_b.centres())
+    inside = ((index >= -0.5) & (index <= np.array(a.grid.values.shape) - 0.5)).all(axis=-1)
+    within = int((known & inside).sum())
+    return {
+        "of_b": min(compared / known.sum(), 1.0),
+        "of_b_within_a": min(compared / max(within, 1), 1.0),
+        "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
+        "within the outline of A",
+    }
 
 
-def _range(target: Grid, a: DemFile, b: DemFile) -> tuple[Floats | None, str]:
-    """Horizontal distance (rows, cols) from the nearest camera, and its unit; None (and why) where none is known."""
+def _by_range(error: Floats, target: Grid, a: DemFile, b: DemFile) -> dict[str, Any]:
+    """Errors by the horizontal distance from the nearest camera; no bins where no camera is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
     unit = "m, from the nearest position of the left camera"
     if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
         cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
     if cameras is None or not len(cameras):
-        return None, "no camera is known: give the folder of a run for A or B"
-    return np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64), unit
+        return {"unit": "no camera is known: give the folder of a run for A or B", "bins": []}
+    distance = np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64)
+    far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
+    # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
+    return {"unit": unit, "bins": evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))}
 
 
 def _lines(figures: Mapping[str, Any]) -> Iterator[str]:

@@ -46,6 +46,9 @@ MIN_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
 
+Image = NDArray[Any]
+
+
 @dataclass
 class Boards:
     """Boards in the images of two sizes: ``views``, and in ``left_out`` name and reason of pairs of no use."""
@@ -54,6 +57,22 @@ class Boards:
     sizes: Sizes
     views: list[BoardView] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def take(self, name: str, images: Sequence[Image]) -> str:
+        """Add the view of a pair of images; why it is of no use otherwise."""
+        if tuple(image.shape[::-1] for image in images) != self.sizes:
+            most = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(self.sizes))
+            return f"its images are not {most} pixels as most are"
+        left, right = (chessboard.find_corners(image, self.corners) for image in images)
+        if left is None or right is None:
+            missing = [side for side, points in zip(SIDES, (left, right), strict=True) if points is None]
+            return f"no whole board in the {' nor in the '.join(missing)} image"
+        view = BoardView(name, left, chessboard.same_order(left, right, self.corners))
+        same = next((other.name for other in self.views if _distance(view, other) < SAME_PLACE_PX), None)
+        if same is not None:
+            return f"the board stands as in view {same}"
+        self.views.append(view)
+        return ""
 
 
 def calibrate(
@@ -139,21 +158,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     if corners is None:
         corners = chessboard.find_size(image for name in images if sizes[name] == usual for image in images[name])
     out = Boards(corners, usual)
-    for name, both in images.items():
-        points = [chessboard.find_corners(image, corners) if sizes[name] == usual else None for image in both]
-        missing = [side for side, p in zip(SIDES, points, strict=True) if p is None]
-        if sizes[name] != usual:
-            most = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(usual))
-            out.left_out.append((name, f"its images are not {most} pixels as most are"))
-        elif points[0] is None or points[1] is None:
-            out.left_out.append((name, f"no whole board in the {' nor in the '.join(missing)} image"))
-        else:
-            view = BoardView(name, points[0], chessboard.same_order(points[0], points[1], corners))
-            same = next((other.name for other in out.views if _distance(view, other) < SAME_PLACE_PX), None)
-            if same is None:
-                out.views.append(view)
-            else:
-                out.left_out.append((name, f"the board stands as in view {same}"))
+    out.left_out = [(name, why) for name, both in images.items() if (why := out.take(name, both))]
     if out.left_out and len(out.views) < LEAST_VIEWS:
         raise InputError(
             "RIL-961",

@@ -15,7 +15,7 @@ from raising import raises
 
 from rille.pipeline.cli import main
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.failures import reported, translated
+from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
 
@@ -44,11 +44,6 @@ def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, ca
     assert end.value.code == 1
     assert line.startswith(f"rille: error {code}: ")
     assert line.count("\n") == 1
-
-
-def test_an_error_of_the_system_without_a_number_keeps_its_words():
-    with raises("RIL-061", "cannot make a: it is not there"), reported("RIL-061", "cannot make a", remedy="change"):
-        raise OSError("it is not there")
 
 
 def test_other_errors_are_left_as_they_are():

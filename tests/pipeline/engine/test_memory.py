@@ -66,15 +66,15 @@ def test_what_could_not_be_known_beforehand_is_refused_when_its_turn_comes(cache
 
 @pytest.mark.parametrize(("largest", "workers"), [(0.0, 4), (250 * MB, 2), (10_000 * MB, 1)])
 def test_there_are_as_many_workers_as_the_limit_holds_of_the_largest_task(largest, workers):
-    budget = memory.Budget(1_100 * MB, 100 * MB)
-    assert budget.workers(4, largest) == workers
+    budget = memory.Budget(1_100 * MB, 100 * MB, 4)
+    assert budget.workers(largest) == workers
     assert budget.alone == 750 * MB
 
 
 def test_on_a_cluster_of_others_only_a_given_limit_counts():
-    assert memory.budget("tcp://host:1", None).limit == math.inf
-    assert memory.budget("tcp://host:1", None).workers(4, 1e15) == 4
-    assert memory.budget("tcp://host:1", 5e9).limit == 5e9
+    assert memory.budget("tcp://host:1", None, 4).limit == math.inf
+    assert memory.budget("tcp://host:1", None, 4).workers(1e15) == 4
+    assert memory.budget("tcp://host:1", 5e9, 4).limit == 5e9
 
 
 def test_workers_give_way_to_a_larger_task_that_is_laid_out_later(cache):
@@ -95,7 +95,7 @@ def test_workers_give_way_to_a_larger_task_that_is_laid_out_later(cache):
     options = driver.RunOptions(executor="dask", jobs=2, memory_limit=limit, ledger=cache / "ledger.jsonl")
     assert driver.run(graph, Store(cache), options).ok
     assert events.facts(cache / "ledger.jsonl")["jobs"] == 2
-    assert memory.Budget(limit, memory.resident()).workers(2, seen[0]) == 1
+    assert memory.Budget(limit, memory.resident(), 2).workers(seen[0]) == 1
 
 
 def test_a_plan_names_the_largest_task_and_the_workers_that_it_leaves_room_for(cache):
@@ -103,16 +103,16 @@ def test_a_plan_names_the_largest_task_and_the_workers_that_it_leaves_room_for(c
         graph = Graph()
         build(graph, size=400)
         driver.run(graph, Store(cache), driver.RunOptions(dry=True))
-        return list(plan.needs(graph, budget, 2))
+        return list(plan.needs(memory.Estimates().planned(graph), budget))
 
-    (line,) = lines(memory.Budget(8e9, 1e8))
+    (line,) = lines(memory.Budget(8e9, 1e8, 2))
     assert line == ("memory: the largest task, numbers/0, is estimated to need 50 MB; room for 2 workers in 8.0 GB")
     with raises("RIL-500", "numbers/0"):
         lines(memory.Budget(3.5e8, 1e8))
     graph = Graph()
     build(graph, size=400)
     driver.run(graph, Store(cache), driver.RunOptions(executor="inline")).check()
-    assert lines(memory.Budget(8e9, 1e8)) == [], "nothing is to do"
+    assert lines(memory.Budget(8e9, 1e8, 2)) == [], "nothing is to do"
 
 
 def test_estimates_upon_estimates_do_not_grow_without_end():

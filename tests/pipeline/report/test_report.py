@@ -15,10 +15,9 @@ from toys.finished import BASIC, TASKS, Written, bundles, products, report, view
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.mockup.sequence import vehicle_at_scale
-from rille.pipeline.export import ranges
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, metrics, strips, words
+from rille.pipeline.report import canvas, figures, gather, metrics, ranges, strips, words
 from rille.pipeline.report.delivery import is_complete
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
