@@ -31,6 +31,7 @@ from rille.datasets.manifest.rig import CAR, STREET, Optics, read_optics, unusua
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
+from rille.datasets.text.reading import TABLE, read_bytes
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import NoParams
@@ -59,7 +60,10 @@ class TakenImage:
 
 def is_bag(path: Path) -> bool:
     """Whether a path is called as bags are."""
-    return (path.is_file() and path.suffix in SUFFIXES) or (path / "metadata.yaml").is_file()
+    about = path / "metadata.yaml"
+    return (path.is_file() and path.suffix in SUFFIXES) or (
+        about.is_file() and b"rosbag2_bagfile_information" in read_bytes(about, "bag's metadata", TABLE)
+    )
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:

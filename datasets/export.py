@@ -77,7 +77,7 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         _write_rows(folder / "poses.txt", [_numbers(sequence.truth[k]) for k in frames])
     if sequence.times is not None:
         _write_rows(folder / "times.txt", [[sequence.times[k]] for k in frames])
-    for frame in pairs:
+    for frame in sorted({*pairs} - {*sequence.lost}):
         if sequence.truth_disparity is not None:
             _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
         if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
@@ -133,13 +133,8 @@ def _write_rig(sequence: Sequence, folder: Path) -> None:
 def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:
     path = folder / "disparity" / f"{name}.npz"
     path.parent.mkdir(exist_ok=True)
-    np.savez_compressed(
-        path,
-        column=np.asarray(truth["column_disparity"][:]),
-        row=np.asarray(truth["row_disparity"][:]),
-        occluded=np.asarray(truth["occluded"][:]),
-        depth=np.asarray(truth["depth"][:]),
-    )
+    names = {"column": "column_disparity", "row": "row_disparity", "occluded": "occluded", "depth": "depth"}
+    np.savez_compressed(path, **{k: np.asarray(truth[name][:]) for k, name in names.items() if name in truth.arrays})  # type: ignore[arg-type]
 
 
 def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materialise) -> None:

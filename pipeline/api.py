@@ -286,7 +286,7 @@ class Run:
                 {
                     "frame": [frame["frame"] for frame in frames],
                     "name": ("frame", [frame["name"] for frame in frames]),
-                    "time": ("frame", [frame["time"] for frame in frames], {"units": "s"}),
+                    "time": ("frame", [frame["time"] for frame in frames], {"units": facts["units"]["time"]}),
                     "axis": list(AXES),
                     "camera_axis": list(AXES),
                 },

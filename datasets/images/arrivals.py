@@ -46,7 +46,8 @@ class Arrivals(Digests):
             status = path.stat()
         except OSError:  # it has gone since the folder was listed
             return False
-        now, seen = time.monotonic(), self._seen.get(path)
+        now, path = time.monotonic(), path.resolve()
+        seen = self._seen.get(path)
         if seen is None or (seen.size, seen.changed_ns) != (status.st_size, status.st_mtime_ns):
             self.changed = now
             self._seen[path] = _Seen(status.st_size, status.st_mtime_ns, now)
@@ -61,7 +62,7 @@ class Arrivals(Digests):
 
     def first_seen(self, path: Path) -> float:
         """When the file was first seen as it is now, by the monotonic clock, s."""
-        return self._seen[path].since
+        return self._seen[path.resolve()].since
 
     def troubles(self) -> list[str]:
         """Why files that are there are not whole, one line each."""

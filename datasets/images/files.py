@@ -9,10 +9,11 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
@@ -264,10 +265,10 @@ def _header(path: Path) -> Header:
 
 
 class Digests:
-    """SHA-256 of files, remembered by (path, size, modification time in ns).
+    """SHA-256 of files, remembered by path, size, inode, and times of modification and of change in ns.
 
-    Where a file for it is given, each new digest is appended there as a line ``digest size mtime_ns path``: it is only
-    a memo, so that a line that does not parse is passed over.
+    Where a file for it is given, each new digest is appended there as a line, the digest first and the path last: it is
+    only a memo, so that a line that does not parse is passed over, and one that cannot be written is left out.
 
     Attributes
     ----------
@@ -281,7 +282,7 @@ class Digests:
         self._memory = memory
         self._known: dict[str, str] = {}
         if memory is not None and memory.is_file():
-            for line in memory.read_text(encoding="utf-8", errors="replace").splitlines():
+            for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
                 digest, _, key = line.partition(" ")
                 if len(digest) == 64:
                     self._known[key] = digest
@@ -296,16 +297,21 @@ class Digests:
             status = path.stat()
         except OSError as error:
             raise InputError("RIL-175", f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
-        key = f"{status.st_size} {status.st_mtime_ns} {path.resolve()}"
+        # No call can set the time of change: a file that was written anew with its old times has another.
+        key = f"{status.st_size} {status.st_ino} {status.st_mtime_ns} {status.st_ctime_ns} {path.resolve()}"
         if key not in self._known:
             with open_regular(path, "image", MOST_BYTES) as file:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
-                self._memory.parent.mkdir(parents=True, exist_ok=True)
                 # Appended, not rewritten: two runs at once both keep what they found, and a torn line is passed over.
-                with self._memory.open("a", encoding="utf-8") as file:
+                with suppress(OSError), _appended(self._memory) as file:
                     file.write(f"{self._known[key]} {key}\n")
         return self._known[key]
+
+
+def _appended(path: Path) -> TextIO:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.open("a", encoding="utf-8", errors="surrogateescape")
 
 
 def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:

@@ -25,6 +25,8 @@ def manifest_text(found: Findings, root: str) -> str:
         loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters["toml"] = _value
+    # Names of files may hold line breaks: what follows one would be no comment, but a key.
+    environment.finalize = lambda value: " ".join(value.splitlines()) if isinstance(value, str) else value
     # File beside this module: the manifest with places for what was found
     return environment.get_template("template.toml.jinja").render(
         **vars(found),

@@ -264,7 +264,7 @@ def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -
     mounted = {"T_vehicle_left": T_vehicle_left.to_list()}
 
     def leg(body: Vehicle, number: int, row: int | None = None) -> Source:
-        args = {"leg": number, "row": row, "vehicle": body.model_dump(mode="json"), **mounted}
+        args = {"leg": number, "row": row, "vehicle": body.model_dump(mode="json", exclude={"name"}), **mounted}
         return Source("rille.datasets.mockup.rover", rover, args)
 
     def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:

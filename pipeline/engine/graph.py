@@ -140,6 +140,17 @@ def done(handle: Handle[F]) -> Generator[Wait, Any, Ref[F]]:
     return ref
 
 
+ANEW = "/anew"
+"""Ends the label of a task that takes the place of an outdated one."""
+
+
+def first_label(label: str) -> str:
+    """The label of the task that was laid out first in the place of this one."""
+    while label.endswith(ANEW):
+        label = label.removesuffix(ANEW)
+    return label
+
+
 @dataclass
 class Graph:
     """Nodes in order of creation, and expansions that wait for some of them.
@@ -199,7 +210,7 @@ class Graph:
             if taken.spec == spec and taken.inputs == given:
                 self.outdated.discard(taken.index)
                 return cast(Handle[F], taken)
-            spec = replace(spec, label=f"{spec.label}/anew")
+            spec = replace(spec, label=spec.label + ANEW)
         _check_ports(spec, given)
         handle: Handle[F] = Handle(len(self.nodes), spec, given, expect=expect)
         self._labels[spec.label] = handle

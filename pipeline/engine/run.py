@@ -230,7 +230,9 @@ class _Run:
                 self.history.save(self.graph.nodes)
             self.result.seconds = time.perf_counter() - begin
             # Without "ok" a ledger is that of a run which did not come to its end.
-            ended = {} if self.result.interrupted else {"ok": self.result.ok}
+            ended: dict[str, Any] = {} if self.result.interrupted else {"ok": self.result.ok}
+            if self.graph.outdated:
+                ended["outdated"] = [h.label for h in self.graph.nodes if h.index in self.graph.outdated]
             self.ledger.run(seconds=round(self.result.seconds, 3), **ended)
             self.progress.close(self.result)
             self.ledger.close()
@@ -493,10 +495,13 @@ class _Run:
             if assumed:  # what was found with other parameters or images does not fit: no more can be said
                 self.result.unknown += assumed
             else:
-                self._failed(Failure(f"plan after {_labels(handles)}", "", error, Failed.of(error).traceback))
+                label = f"plan after {_labels(handles)}"
+                self.ledger.note(label, "failed", f"{type(error).__name__}: {error}")
+                self._failed(Failure(label, "", error, Failed.of(error).traceback))
 
     def _leave_out(self) -> None:
-        """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for."""
+        """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for, and
+        those of an outdated calibration that failed."""
         if self.graph.cut is not None:
             self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.asked)
             self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.asked]
@@ -508,6 +513,10 @@ class _Run:
                 else:
                     handle.reason = self.stopped
                     self._resolve(handle, "skipped")
+        lost = {h.index for h in self.graph.nodes if h.status in ("failed", "skipped")} & self.graph.outdated
+        labels = {h.label for h in self.graph.nodes if h.index in lost}
+        self.graph.nodes[:] = [h for h in self.graph.nodes if h.index not in lost]
+        self.result.failures = [f for f in self.result.failures if f.label not in labels]
         for handles, *_ in self.graph.expansions:
             waits = [h for h in handles if not h.done]
             self.result.unknown += [h.label for h in waits]

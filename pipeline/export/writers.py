@@ -183,7 +183,7 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, float):
         # Nine digits of seconds since 1970 would be steps of ten seconds.
-        return f"{value:.9g}" if abs(value) < 1e6 else f"{value:.15g}"
+        return f"{value:.9g}" if abs(value) < 1e4 else repr(float(value))
     # Names come from who wrote the data: what a terminal would obey is spelt out, what a spreadsheet would run quoted.
     text = plain(str(value))
     # A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text
@@ -215,12 +215,14 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
     # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
     turns = Rotation.from_matrix(poses[posed, :, :3]).as_quat(canonical=True)
     head = f"time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}"
-    _write_rows(path, np.column_stack([np.asarray(times)[posed], poses[posed, :, 3], turns]), head)
+    rows = np.column_stack([np.asarray(times, np.float64)[posed], poses[posed, :, 3], turns])
+    # All digits of a time: microseconds since 1970 have sixteen.
+    _write_rows(path, rows, ["%s"] + 7 * ["%.15g"], head)
 
 
-def _write_rows(path: Path, rows: NDArray[np.float64], head: str = "") -> None:
+def _write_rows(path: Path, rows: NDArray[np.float64], form: str | list[str] = "%.15g", head: str = "") -> None:
     out = io.StringIO()
-    np.savetxt(out, rows, "%.15g", header=head)
+    np.savetxt(out, rows, form, header=head)
     atomic.write(path, out.getvalue())
 
 

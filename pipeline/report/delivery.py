@@ -53,7 +53,7 @@ def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
 
 def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
     """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
-    done = ["every task was done"] if view.tasks else []
+    done = ["every task was done"] if view.tasks and all(t.status in ("computed", "cached") for t in view.tasks) else []
     if view.part:
         absent = [_item("part", f"Left out, as {view.part} asks", left_out(view.left_out))]
         wrong = [item for item in accounted["missing"] if item["kind"] == "contradiction"]
@@ -76,7 +76,8 @@ def left_out(stages: Mapping[str, int]) -> str:
 def _unmade(view: RunView) -> Items:
     """Stages and files that were wanted, and that this run does not have."""
     made = {name for t in view.tasks for name in (t.stage, t.label.partition("/")[0], t.label.removeprefix("output/"))}
-    why = "this sequence has none, or a parameter switches it off"
+    failed = any(t.status == "failed" for t in view.tasks)
+    why = "what it needs failed" if failed else "this sequence has none, or a parameter switches it off"
     return [_item("part", f"No {name}", why) for name in (*view.until, *view.only) if name not in made]
 
 

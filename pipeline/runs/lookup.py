@@ -62,17 +62,17 @@ def find(text: str, runs: Path) -> Path:
     """
     known = all_runs(runs)
     if text == "latest" and known:
-        return max(known, key=lambda run: run.name)
+        return max(known, key=lambda run: run.name).resolve()
     # A path before a name: a user who stands in another folder of runs means what lies there.
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()
     for run in known:
         if text in (run.name, name(run)):
-            return run
+            return run.resolve()
     started = [run for run in known if run.parent.name == text]
     if started:  # none of them came to its end
-        return started[-1]
+        return started[-1].resolve()
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=near(text, names) or where)

@@ -159,7 +159,15 @@ def cache_folder(given: str | Path | None) -> Path:
 
 
 def named(output: Path, ending: str) -> Path:
-    """One of the files of an output that is named without ending; a name with the ending of one is that of all."""
+    """One of the files of an output that is named without ending; a name with the ending of one is that of all.
+
+    Raises
+    ------
+    ConfigError
+        It has no name, as ``.`` has none.
+    """
+    if not output.name:
+        raise ConfigError("RIL-969", f"the output {output} is a folder", remedy="name the files in it, without ending")
     return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.run import Failure
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
@@ -68,15 +69,21 @@ def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made:
         made[output.name] = node
 
 
-def task_rows(graph: Graph) -> tuple[TaskRow, ...]:
-    """One row a task, with the seconds that it took whenever it was computed."""
+def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
+    """One row a task, with the seconds that it took whenever it was computed, and one a plan that failed."""
     rows = []
     for h in graph.nodes:
         before = None if h.ref is None else h.ref.seconds
         seconds = h.took.seconds if h.status == "computed" else before
-        reason = " ".join(str(h.error).split()) if h.error is not None else h.reason
+        reason = _one_line(h.error) if h.error is not None else h.reason
         rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason, h.cause))  # type: ignore[arg-type]
+    known = {row.label for row in rows}
+    rows += [TaskRow(f.label, "", "failed", None, _one_line(f.error)) for f in failures if f.label not in known]
     return tuple(rows)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
 
 
 def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, Any]:

@@ -8,8 +8,8 @@ complete or whose holes are named in its report.
 from __future__ import annotations
 
 import hashlib
-import os
 import sys
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -301,7 +301,10 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     if not (opened.folder / "config.toml").exists():
         text = f"{opened.folder} was removed while the run was under way"
         raise RilleError("RIL-740", text, remedy="run again: what was computed is in the cache")
-    tasks = run_files.task_rows(opened.graph)
+    if made["facts"].ref is None:
+        # Without them there is no report, and what kept them from being made is the failure.
+        result.check()
+    tasks = run_files.task_rows(opened.graph, result.failures)
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
@@ -345,7 +348,6 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
 def _point_latest(folder: Path) -> None:
     """Move ``latest`` to a finished run in one step."""
     # symlink_to cannot replace a link; a rename can, in one step, so a reader finds the earlier or the new run.
-    link = folder.parent / f".latest-{os.getpid()}"
-    link.unlink(missing_ok=True)  # of a killed run: in a container numbers of processes repeat
+    link = folder.parent / f".latest-{uuid.uuid4().hex}"
     link.symlink_to(folder.name, target_is_directory=True)
     link.replace(folder.parent / "latest")

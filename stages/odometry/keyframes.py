@@ -136,8 +136,10 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
     return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
 
 
-def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
-    """What the choice could not give."""
+def _warnings(
+    steps: Sequence[Step], basic: Sequence[int], overlap: Sequence[float | None], params: KeyframesParams
+) -> list[str]:
+    """What the choice of ``basic`` pairs could not give; ``overlap`` of each with the one before."""
     lines = []
     blind = [k for k, step in enumerate(steps) if not step.overlaps]
     if blind:
@@ -146,12 +148,18 @@ def _warnings(steps: Sequence[Step], overlap: Sequence[float | None], params: Ke
             f" {min(steps[k].match_rate for k in blind):.0%}), first behind the frame at position {blind[0]}: the"
             " overlap there is not known, and the frames are tracked on a poor prediction"
         )
-    least = min((v for v in overlap if v is not None), default=1.0)
+    least, at = min(((v, k) for k, v in enumerate(overlap) if v is not None), default=(1.0, 0))
     wanted = params.overlap if params.rule == "overlap" else LITTLE
     if least < wanted:
         lines.append(
-            f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted:"
-            + (" set keyframes.stride lower" if params.rule == "stride" else " the camera moves that far in one frame")
+            f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted: "
+            + (
+                "set keyframes.stride lower"
+                if params.rule == "stride"
+                else "the camera moves that far in one frame"
+                if basic[at] - basic[at - 1] == 1
+                else f"the frames between positions {basic[at - 1]} and {basic[at]} may not be basic pairs"
+            )
         )
     return lines
 
@@ -181,6 +189,6 @@ def keyframes_stage(
         "why": ["first frame", *why],
         "displacement": [step.displacement for step in moves],
         "match_rate": [step.match_rate for step in moves],
-        "warnings": _warnings(moves, overlap, params),
+        "warnings": _warnings(moves, basic, overlap, params),
     }
     return Bundle({}, meta)

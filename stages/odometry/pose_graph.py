@@ -160,6 +160,13 @@ class PoseGraph:
         sources = np.arange(self.factors.shared.shape[2])
         return np.asarray(np.where(sources < self.common, self.excess**-2.0, 1.0))
 
+    def holds_together(self, kept: Bools) -> bool:
+        """Whether the factors that are kept (m,) and measure positions connect all nodes."""
+        a, b = self.factors.ends[kept & (self.factors.root[:, :, :3] != 0).any((1, 2))].T
+        links = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=2 * (self.nodes,))
+        count, _ = scipy.sparse.csgraph.connected_components(links, directed=False)
+        return bool(count == 1)
+
     def errors(self, state: GraphState) -> Floats:
         """Whitened errors (m, 6) of the factors, before weights."""
         off = self._difference(state)[0] - self.factors.shared @ state.sources

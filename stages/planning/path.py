@@ -261,8 +261,12 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
             if end is not None:
                 cells = trace(steps, end)
                 return Route(cells, ground.xyz(cells), planner, below, span)
+    nothing = np.empty((0, 2), np.int64), np.empty((0, 3)), planner, "middle", span
+    if target is not None and blocking < far:
+        # Rows cross the map: the target lies aside of what they reach.
+        return Route(*nothing, JOINED)
     reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
-    return Route(np.empty((0, 2), np.int64), np.empty((0, 3)), planner, "middle", span, reason, blocking)
+    return Route(*nothing, reason, blocking)
 
 
 def _grounds(ground: PathMaps, ends: Cells, behind: int, *, by_rows: bool) -> Iterator[tuple[str, Bools]]:

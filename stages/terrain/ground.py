@@ -157,12 +157,14 @@ class PlaneView:
         """
         good = (self.along <= max_cells * cell) & (sigma_d <= max_sigma * self.slope)
         if np.count_nonzero(good) < 3:
-            enough = np.sort(np.maximum(self.along / max_cells, sigma_d / self.slope))[:3][-1]
-            raise CoarseGroundError(
-                "RIL-344",
-                f"no ground is seen well enough for cells of {cell:g} m",
-                remedy=f"set locus.cell_size to {1.1 * enough:.2g} m or more",
-            )
+            # A limit that is not stated is the cell.
+            stated = max_sigma != cell
+            by_cell = np.sort(np.maximum(self.along / max_cells, 0.0 if stated else sigma_d / self.slope))[:3][-1]
+            by_sigma = np.sort((sigma_d / self.slope)[self.along <= max_cells * max(cell, by_cell)])[:3][-1]
+            needs = (("cell_size", cell, by_cell), ("max_sigma", max_sigma, by_sigma if stated else 0.0))
+            remedy = " and ".join(f"locus.{n} to {1.1 * need:.2g} m or more" for n, has, need in needs if need > has)
+            text = f"no ground is seen well enough for cells of {cell:g} m"
+            raise CoarseGroundError("RIL-344", text, remedy=f"set {remedy}")
         low, high = np.quantile(self.xyz[good, :2], [self.stray, 1.0 - self.stray], axis=0)
         return [float(low[0]), float(high[0]), float(low[1]), float(high[1])]
 

@@ -93,13 +93,14 @@ def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, A
 def _log_ratio(grey: Floats, other: Floats) -> float | None:
     """Median logarithm of the factor between the grey values; None where too few tell."""
     low, high = USABLE_GREY
-    good = (np.fmin(grey, other) > low) & (np.fmax(grey, other) < high)
+    # Beside the rims of the images an elevation has no grey value: NaN, which is in no range.
+    good = (np.minimum(grey, other) > low) & (np.maximum(grey, other) < high)
     if np.count_nonzero(good) < MIN_CELLS:
         return None
     return float(np.median(np.log(grey[good] / other[good])))
 
 
-@stage("overlap_qa", version=3)
+@stage("overlap_qa", version=4)
 def overlap_qa_stage(
     params: NoParams, dem: Bundle[DemFacts], others: Sequence[Bundle[DemFacts]]
 ) -> Bundle[OverlapFacts]:

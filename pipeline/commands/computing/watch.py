@@ -40,7 +40,12 @@ def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
     seq
         A folder or a manifest of image files. A file is taken once it is whole.
     """
-    configuration.build(session.configured(options)[1])  # a wrong parameter should not wait for the first pair
+    # A wrong parameter should not wait for the first pair.
+    of_sequence, of_stages = session.configured(options)
+    configuration.build(of_stages)
+    if of_sequence:
+        text = f"{next(iter(of_sequence))}: a sequence that is watched has no parameters"
+        raise ConfigError("RIL-088", text, remedy="leave it out; `rille reconstruct` takes it")
     kept, arrivals = list[Workers](), Arrivals(cache_folder(options.cache) / "files.json")
     watched = _Watched(seq, options, kept, arrivals)
     try:

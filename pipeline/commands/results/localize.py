@@ -23,7 +23,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
-from rille.pipeline.export.writers import write_trajectory_tum
+from rille.pipeline.export.writers import ENGINEERING_CRS, write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
 from rille.stages.core.declare import Bundle
@@ -32,6 +32,9 @@ from rille.stages.evaluation.place import place
 from rille.stages.geometry.geometry import from_above, heading_of, rotation_exp, rotation_log
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
 from rille.stages.terrain.relief.grid import Grid
+
+MAP_CRS = ENGINEERING_CRS.replace("Rille world frame", "frame of a map")
+"""Of coordinates of a map that states no system."""
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -148,6 +151,7 @@ def localize(
     output
         Files to write, without ending.
     """
+    written = [named(output, ".json")]
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
     folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
@@ -167,7 +171,9 @@ def localize(
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    written = [named(output, ".json")]
+    # Where the place is not known now, files of an earlier one would be taken for its.
+    for ending in (".tum", ".gpkg"):
+        named(output, ending).unlink(missing_ok=True)
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else for_file(found))}
     atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
@@ -234,6 +240,5 @@ def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store
         return
     if planned is not None:
         moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
-        frame = Georeference(crs, (0.0, 0.0, 0.0), 0.0) if crs else None
-        write_path(named(output, ".gpkg"), moved, frame)
+        write_path(named(output, ".gpkg"), moved, Georeference(crs or MAP_CRS, (0.0, 0.0, 0.0), 0.0))
         yield named(output, ".gpkg")

@@ -86,14 +86,15 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     layers += [_laid(number, first, one) for number, one in enumerate(sessions, start=1)]
     merged = merge_layers(layers, lattice, MergeParams.model_validate({}))
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
+    # First, for by it the folder is known as ours, and the same command goes on after a kill.
+    facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
+    atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
     for name, band, values, unit in (
         ("dem.tif", "elevation", height, "m"),
         ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
         ("ortho.tif", "ortho", merged.ortho, ""),
     ):
         write_raster(output / name, {band: np.asarray(values, np.float32)}, lattice, Meaning(unit), first.place)
-    facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
-    atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
     for one in sessions:
         print(_line(one))
     known = np.isfinite(merged.elevation)

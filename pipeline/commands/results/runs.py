@@ -36,8 +36,10 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
     yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s}"
     for run in sorted(chosen, key=lambda run: run.name):
         with lookup.reading(run):
-            statuses = Counter(row["status"] for row in events.read(run / lookup.LEDGER))
             facts = events.facts(run / lookup.LEDGER)
+            outdated = set(facts.get("outdated", ()))
+            rows = (row for row in events.read(run / lookup.LEDGER) if row["label"] not in outdated)
+            statuses = Counter(row["status"] for row in rows)
             missing = statuses["failed"] + statuses["skipped"]
             # "ok": all tasks have ended; "total": the files and the report are written, too.
             whole = "interrupted" if "total" not in facts else "with holes" if facts.get("holes") else "complete"

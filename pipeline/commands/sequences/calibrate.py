@@ -262,7 +262,8 @@ def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
         "avg_reprojection_error": rig.rms,
     }
     for name, used in (("views", True), ("views_left_out", False)):
-        views = [vars(r) for r in rig.residuals if r.used == used]
+        # OpenCV escapes an apostrophe in a way that YAML does not know.
+        views = [vars(r) | {"name": r.name.replace("'", "_")} for r in rig.residuals if r.used == used]
         content[name] = {f"view_{k}": {n: v for n, v in view.items() if n != "used"} for k, view in enumerate(views)}
     content["standard_deviations"] = {name.replace(" ", "_"): value for name, value in rig.sigma.items()}
     # In memory: the file is written by Python, whose errors say what is wrong.

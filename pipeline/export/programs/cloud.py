@@ -57,7 +57,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
     place, pairs = georeference_of(run.run), PlacedPairs(run, every)
     # LAS 1.4 knows the first version of WKT alone.
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
-    write = _write_laz if path.suffix == ".laz" else _write_ply
+    write = _write_laz if path.suffix.lower() == ".laz" else _write_ply
     parts = (_columns(run, one, place) for one in pairs)
     points = write(path, _thinned(parts, voxel) if voxel else parts, crs)
     return f"{count(points, 'point')} of {pairs.words}"
@@ -93,7 +93,10 @@ def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> int:
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
+    # Of the first pair that has any, if one has.
     first = next(parts)
+    while not len(first["x"]) and (following := next(parts, None)) is not None:
+        first = following
     header = laspy.LasHeader(point_format=7, version="1.4")
     # Date that every LAZ file states, so that equal clouds make equal files
     header.creation_date, header.generating_software, header.system_identifier = date(2000, 1, 1), "Rille", "stereo"

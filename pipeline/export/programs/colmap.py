@@ -117,7 +117,8 @@ def build(
         model.add_frame(ours)
         for side, camera in cameras.items():
             image = pycolmap.Image(
-                name=f"{side}/{names.get(frame, f'{frame:06d}.png')}",
+                # COLMAP's text files end a name at a blank.
+                name=f"{side}/{names.get(frame, f'{frame:06d}.png')}".replace(" ", "_"),
                 keypoints=np.array(seen[frame, side]).reshape(-1, 2),
                 camera_id=camera.camera_id,
                 image_id=number[frame, side],

@@ -15,7 +15,7 @@ import numpy as np
 
 from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.writers import FRAME, Meaning, write_bands
+from rille.pipeline.export.writers import FRAME, WORLDS, Meaning, write_bands
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.validity import matched
 from rille.stages.terrain.camera_products import camera_products
@@ -32,7 +32,9 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     for one in pairs:
         tags = _tags(one)
         for name, bands, unit, words in _products(one):
-            meaning = Meaning(unit, np.nan, {"frame": FRAME, "unit": unit, "content": words, **tags})
+            meaning = Meaning(
+                unit, np.nan, {"frame": WORLDS.get(pairs.vertical, FRAME), "unit": unit, "content": words, **tags}
+            )
             write_bands(folder / f"{one.pair:06d}_{name}.tif", bands, meaning, PROFILE)
     return f"XYZ, RNG, RNE, UVW, SLP, RUF and DSP of {pairs.words}"
 

@@ -27,7 +27,8 @@ class PlacedPair:
 
 
 class PlacedPairs:
-    """All of a run; iterated, one is opened at a time. ``words``: how many there are, and how many have no pose.
+    """All of a run; iterated, one is opened at a time. ``words``: how many there are, and how many have no pose;
+    ``vertical``: source of the world's vertical.
 
     Raises
     ------
@@ -40,6 +41,7 @@ class PlacedPairs:
         trajectory = run.one("trajectory", last=True)
         frames, pieces = trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist()
         self._poses = dict(zip(frames, np.asarray(trajectory["poses"]), strict=True))
+        self.vertical = trajectory.meta["verticals"][trajectory.meta["main"]]
         here = {frame for frame, piece in zip(frames, pieces, strict=True) if piece == trajectory.meta["main"]}
         pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
         self._run, self._every, self.pairs = run, every, [pair for pair in pairs if pair in here]

@@ -42,6 +42,9 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
             copy(run.run / name, folder / name)
             files += list(_files(folder, name, what))
     facts = json.loads(read_text(run.run / "report.json", "report", TABLE))
+    if facts["command"].split()[:2] != ["rille", "reconstruct"]:
+        text = "a drive cannot be run again from a crate"
+        raise InputError("RIL-611", text, remedy="send its folder, which has config.toml and report.html")
     inputs = [_entity(f"#{k}", "PropertyValue", f"sha256 of {k}", value=digest) for k, digest in run.digests()]
     graph = [*_about(run.run, facts, files, inputs), *files, *inputs, *_programs(facts["versions"])]
     context = [f"{SPECIFICATION}/context", {"sha256": "https://schema.org/sha256"}]  # newer than the specification
@@ -123,6 +126,12 @@ class Crate:
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def describes_run(folder: Path) -> bool:
+    """Whether a folder is a crate that holds a run, as data sets are crates, too."""
+    path = folder / METADATA
+    return path.is_file() and '"#run"' in read_text(path, "crate", TABLE)
 
 
 def read(folder: Path) -> Crate:

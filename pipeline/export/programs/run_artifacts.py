@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
+from rille.pipeline.engine.graph import first_label
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.writers import check_folder
@@ -42,15 +43,20 @@ def export_run(form: str, run: Path, target: Path, store: Store, **thinning: flo
 
 
 class RunArtifacts:
-    """The artifacts that the ledger of a run refers to; opened, they read their arrays when these are asked for."""
+    """The artifacts that the ledger of a run refers to; opened, they read their arrays when these are asked for.
+
+    Where the run has corrected its calibration a label stands for the task that was laid out last.
+    """
 
     def __init__(self, run: Path, store: Store) -> None:
         self.run, self._store = run, store
 
     @cached_property
     def _rows(self) -> dict[str, dict[str, Any]]:
-        rows = events.read(self.run / "ledger.jsonl")
-        return {row["label"]: row for row in rows if row["status"] in ("computed", "cached") and "key" in row}
+        ledger = self.run / "ledger.jsonl"
+        outdated = set(events.facts(ledger).get("outdated", ()))
+        made = (row for row in events.read(ledger) if row["status"] in ("computed", "cached") and "key" in row)
+        return {first_label(row["label"]): row for row in made if row["label"] not in outdated}
 
     def find(self, label: str) -> Bundle | None:
         """The artifact of exactly this label, if the run has it."""
@@ -78,7 +84,7 @@ class RunArtifacts:
     def input(self, label: str, port: str) -> Bundle:
         """The artifact that a task of the run has read at a port."""
         self.one(label)
-        return self.one(self._rows[label]["inputs"][port])
+        return self.one(first_label(self._rows[label]["inputs"][port]))
 
     def left_image(self, frame: int) -> Bundle:
         """The left image of an ideal camera, which was matched and tracked."""

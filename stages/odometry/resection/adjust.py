@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
@@ -159,28 +160,52 @@ def adjust_stage(
     sensors.believe(own)
     between = Factors.joined([stated, *sensors.between(own)])
     sure = np.arange(len(between.ends)) >= len(given)
-    own = sensors.laid(join(own, between, sure))
+    apart, own = own, sensors.laid(join(own, between, sure))
     alone = own.piece[stated.ends[:, 0]] != own.piece[stated.ends[:, 1]]
     lines = [
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
     known, excess = chain.beside(stated), 1.0
+    try:
+        pieces = adjusted_pieces(own, known, sensors)
+    except DegenerateError as error:
+        lines.append(f"{error.message}: they are not joined")
+        pieces = adjusted_pieces(apart, known, sensors)
+    for nodes, inside, done in pieces:
+        excess = max(excess, done.graph.excess)
+        sources = known.shared.shape[2]
+        _write(out, posed[nodes], done, slice(sources - calibration, sources))
+        for k in np.flatnonzero(~done.kept[: len(inside)]):
+            ends = np.searchsorted(nodes, known.ends[inside[k]])
+            lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends]))
+    if excess > 1.0:
+        lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
+    # Some hold for several pieces alike.
+    lines = list(dict.fromkeys([*lines, *sensors.lines]))
+    return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts})
+
+
+Piece = tuple[NDArray[np.intp], NDArray[np.intp], Adjusted]
+
+
+def adjusted_pieces(own: OwnTrajectory, known: Factors, sensors: Sensors) -> list[Piece]:
+    """Nodes of each piece that is adjusted, the numbers of the factors between them, and their adjustment.
+
+    Raises
+    ------
+    DegenerateError
+        Factors that joined a piece contradict the rest.
+    """
+    pieces: list[Piece] = []
     for number in np.unique(own.piece):
         nodes = np.flatnonzero(own.piece == number)
         inside = np.flatnonzero(np.isin(known.ends, nodes).all(1))
         ends = np.searchsorted(nodes, known.ends[inside])
         done = sensors.adjusted(own.take(nodes), replace(known.take(inside), ends=ends))
-        if done is None:
-            continue
-        excess = max(excess, done.graph.excess)
-        sources = known.shared.shape[2]
-        _write(out, posed[nodes], done, slice(sources - calibration, sources))
-        for k in np.flatnonzero(~done.kept[: len(inside)]):
-            lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends[k]]))
-    if excess > 1.0:
-        lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
-    return _bundle(trajectory, out, [*lines, *sensors.lines], {"excess": excess, "priors": sensors.facts})
+        if done is not None:
+            pieces.append((nodes, inside, done))
+    return pieces
 
 
 def _write(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> None:

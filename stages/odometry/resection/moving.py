@@ -58,7 +58,7 @@ def departures(
     cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
     here = np.asarray((cells + 0.5) * scale - 0.5, np.float64)
     points = triangulated(
-        here, here + _coarse(disparity, shape), rig, RigidTransform.identity(), np.full(len(here), DISPARITY_SIGMA_PX)
+        here, here + _coarse(disparity, here), rig, RigidTransform.identity(), np.full(len(here), DISPARITY_SIGMA_PX)
     )
     to = T_b_a.inverse() if back else T_b_a
     there, farther = (
@@ -70,12 +70,13 @@ def departures(
     return np.asarray((off - SIGMAS * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
 
 
-def _coarse(disparity: Bundle, shape: tuple[int, int]) -> Floats:
-    """Disparities (n, 2) at the pixels of a coarse grid, row by row: that of the pixel in the middle; NaN unmatched."""
+def _coarse(disparity: Bundle, places: Floats) -> Floats:
+    """Disparities (n, 2) of the pixels at some places (n, 2), column and row, in the image or beside its end; NaN
+    unmatched."""
     good = matched(np.asarray(disparity["validity"]))
-    maps = [np.where(good, np.asarray(disparity[n]), np.nan) for n in ("column_disparity", "row_disparity")]
-    coarse = cv2.resize(np.stack(maps, -1), shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    return np.asarray(coarse, np.float64).reshape(-1, 2)
+    col, row = np.minimum((places + 0.5).astype(np.intp), [good.shape[1] - 1, good.shape[0] - 1]).T
+    maps = [np.asarray(disparity[n])[row, col] for n in ("column_disparity", "row_disparity")]
+    return np.where(good[row, col, None], np.stack(maps, axis=-1), np.nan).astype(np.float64)
 
 
 def _at(shift: Floats, places: Floats) -> Floats:
@@ -118,6 +119,7 @@ def moving_stage(
         a, b = (RigidTransform.from_matrix(pose) for pose in poses)
         off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), b.inverse() @ a, back=back)
         parts = moving(off).astype(np.uint8)
-        out = cv2.resize(parts, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
+        scale = 2 ** int(motion.meta["level"])
+        out = parts.repeat(scale, axis=0).repeat(scale, axis=1)[: shape[0], : shape[1]]
     share = float(out.mean())
     return Bundle({"moving": out}, {"share": share})

@@ -7,13 +7,14 @@ whose factors the adjusted graph leaves out, is not used.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
 from rille.stages.odometry.resection.sensors import (
@@ -108,8 +109,9 @@ class Sensors:
         self.lines.append(f"[{name}] {how}is not used: {reason}: {REMEDY[name]}")
 
     def between(self, own: OwnTrajectory) -> list[Factors]:
-        """Factors between frames, which may join pieces, clocks being right."""
-        return [sensor.factors(own, 0.0) for sensor in self.used.values() if isinstance(sensor, RelativePrior)]
+        """Factors of ways between frames, which may join pieces, clocks being right."""
+        ways = (one for one in self.used.values() if isinstance(one, RelativePrior) and one.drift)
+        return [sensor.factors(own, 0.0) for sensor in ways]
 
     def laid(self, own: OwnTrajectory) -> OwnTrajectory:
         """The trajectory with those pieces joined that positions join."""
@@ -126,6 +128,11 @@ class Sensors:
         """A piece adjusted to its chain and stated factors (``known``) and to the sensors; None: nothing to adjust.
 
         The place is a node behind those of the piece.
+
+        Raises
+        ------
+        DegenerateError
+            The factors that are kept do not hold the piece together.
         """
         clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
         done = None
@@ -139,13 +146,15 @@ class Sensors:
             ends = np.where(factors.ends < 0, nodes, factors.ends)
             graph = PoseGraph(replace(factors, ends=ends), nodes + 1, np.ones(len(ends)), common=common)
             start = GraphState.of(np.concatenate([own.poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
+            _check_whole(graph, np.ones(len(ends), bool))
             done = adjust(graph, start, excesses)
+            _check_whole(graph, done.kept)
             if excesses == EXCESS and not self._refused(groups, done, len(known.ends), common):
                 break
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
-        self._account(clocks, done.state.poses[-1])
+        self._account(groups, clocks, done.state.poses[-1])
         return done
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
@@ -189,8 +198,8 @@ class Sensors:
                 clocks[name] = clock if clock.determined else clock._replace(late=0.0)
         return clocks
 
-    def _account(self, clocks: Mapping[str, Clock], place: Floats) -> None:
-        """Facts and lines of the sensors that were used; ``place`` (3, 4) is its pose in the world."""
+    def _account(self, groups: Collection[str], clocks: Mapping[str, Clock], place: Floats) -> None:
+        """Facts and lines of the sensors that a piece was adjusted to; ``place`` (3, 4) is its pose in the world."""
         for name, clock in clocks.items():
             self.facts[name] |= {
                 "late_s": clock.late,
@@ -204,12 +213,13 @@ class Sensors:
                     f"[{name}] its times are {clock.late:.3f} s late (standard deviation {clock.sigma:.3f} s), which "
                     f"is taken into account: add {-clock.late:.3f} to its time_offset"
                 )
-        for name, fact in self.facts.items():
+        for name in groups:
+            fact = self.facts[name]
             # One in a hundred is to be expected.
             if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
-        if isinstance(positions := self.used.get("positions"), PositionPrior):
+        if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
             there = (RigidTransform.from_matrix(place) @ positions.laid).inverse()
             origin, ahead = there.translation, there.rotation[:, 1]
             azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
@@ -218,3 +228,9 @@ class Sensors:
                 where = ", ".join(f"{v:.2f}" for v in origin)
                 text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
                 self.lines.append(f"{text}: state these with world.crs, and maps lie there")
+
+
+def _check_whole(graph: PoseGraph, kept: Bools) -> None:
+    """Refuse a graph of which those factors alone that are ``kept`` (m,) leave nodes without a position."""
+    if not graph.holds_together(kept):
+        raise DegenerateError("RIL-396", "what joined pieces of the trajectory contradicts the rest")

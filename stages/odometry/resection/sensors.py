@@ -43,6 +43,8 @@ CAMERA_SHARE = 0.05
 """Error of the camera's own ways that no sensor is doubted for."""
 MIN_TURN = math.radians(1.0)
 """RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
+MIN_WAY_NOISES = 3.0
+"""Noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean nothing."""
 HELD = 0.02
 """Weight of the identity against the data where Q is sought: along a straight way a roll does not show."""
 MIN_SIGMAS = 3.0
@@ -75,6 +77,12 @@ class Sensor(Protocol):
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
         """What it says of these nodes, its clock being ``late``, s; the place is node -1, the last source the clock."""
         ...
+
+
+def _noise(own: OwnTrajectory) -> float:
+    """RMS noise, m, of the camera's positions, of which second differences show the root of six times as much."""
+    bends = np.diff(own.poses[:, :, 3], 2, axis=0)[own.piece[2:] == own.piece[:-2]]
+    return math.sqrt(float((bends**2).sum(1).mean()) / 6.0) if len(bends) else 0.0
 
 
 def moved(poses: Floats, rows: Bools, move: RigidTransform) -> Floats:
@@ -162,6 +170,8 @@ class RelativePrior:
             return 0.0, ""
         if self.drift:
             ways = moves[:, :, 3]
+            if np.sqrt((ways**2).sum(1).mean()) < MIN_WAY_NOISES * math.sqrt(2.0) * _noise(own):
+                return 0.0, ""
             # A turn that grows along the way leads it aside by half as much.
             allowed = self.drift + 0.5 * self.turn * float(np.linalg.norm(ways, axis=1).mean())
             return departure(ways, said[:, :, 3], CAMERA_SHARE + MIN_SIGMAS * allowed, "ways")
@@ -341,8 +351,9 @@ def placed(fixes: Fixes, own: OwnTrajectory) -> tuple[RigidTransform, OwnTraject
 
 
 def enough(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
-    """Numbers of the pieces that have enough positions to be laid on them."""
-    return [int(k) for k, count in enumerate(np.bincount(piece[fixes.nodes])) if count >= MIN_FIXES]
+    """Numbers of the pieces that have positions beside enough nodes to be laid on them."""
+    beside = np.bincount(piece[np.unique(fixes.nodes)])
+    return [int(k) for k, count in enumerate(beside) if count >= MIN_FIXES]
 
 
 def anchor(pose: Floats) -> Factors:

@@ -280,9 +280,10 @@ def trajectory_stage(
     links = [ChainLink.of(b, inputs.intrinsics) for b in inputs.segments]
     parts = [b.meta["per_frame"] for b in inputs.segments]
     if not parts:
-        # One pair alone.
+        # One pair alone, behind lost frames, if some are.
+        gone = {int(one["frame"]) for one in lost}
         links = [ChainLink(levels[0].matrix34[None], np.zeros((1, 6, 6)), *np.zeros((2, 1, 6, 0)))]
-        parts = [[{"frame": frames[0], "inliers": 0}]]
+        parts = [[{"frame": next(f for f in frames if f not in gone), "inliers": 0}]]
     # A key frame was posed by the segment before.
     facts = [*parts[0][:1], *(fact for part in parts for fact in part[1:])]
     causes = {int(f["frame"]): str(f["cause"]) for f in lost}

@@ -94,10 +94,11 @@ def coverage(
     elevation, std = (values[row, col].astype(np.float64) for values in (dem.elevation, dem.elevation_std))
     # Within three standard deviations and a cell.
     on = np.abs(elevation - z[inside]) <= 3.0 * std + lattice.cell
+    count = max(len(z), 1)
     shares = {
-        "outside": 1.0 - np.count_nonzero(inside) / len(z),
-        "unsure": np.count_nonzero(on & (std > greatest)) / len(z),
-        "off": np.count_nonzero(~on) / len(z),
+        "outside": np.count_nonzero(~inside) / count,
+        "unsure": np.count_nonzero(on & (std > greatest)) / count,
+        "off": np.count_nonzero(~on) / count,
     }
     facts: dict[str, Any] = {**shares, "settings": None, "size": None}
     if not on.any():

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rille.stages.core.arrays import Floats32
+from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, Memory, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError
 from rille.stages.core.validity import matched_back
@@ -198,6 +198,16 @@ def _matches(disparity: Bundle) -> Matches:
     return Matches(*maps, good, disparity.arrays.get("disparity_std"))
 
 
+def _lead_to(back: Matches, marked: Bools) -> Bools:
+    """Which matched pixels of the right image (row, col) lead to marked ones of the left image (row, col)."""
+    row, col = np.nonzero(back.usable)
+    ends = row + np.asarray(back.row)[row, col], col + np.asarray(back.column)[row, col]
+    near = tuple(np.rint(end).astype(np.intp).clip(0, n - 1) for end, n in zip(ends, marked.shape, strict=True))
+    out = np.zeros(back.usable.shape, bool)
+    out[row, col] = marked[near]
+    return out
+
+
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
     """Bytes of the model's arrays, four of float32, and a half more for refining them."""
     if args["frame"] == "world":
@@ -252,8 +262,12 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
     rig, level, trajectory = Rig.from_dict(inputs.rig.meta["rig"]), inputs.level.meta, inputs.trajectory
     T_local_left = RigidTransform.from_matrix(level["T_local_left"])
     matches = _matches(inputs.disparity)
+    back = _matches(inputs.back) if inputs.back is not None else None
     if inputs.moving is not None:
-        matches.usable[np.asarray(inputs.moving["moving"]) != 0] = False
+        moving = np.asarray(inputs.moving["moving"]) != 0
+        matches.usable[moving] = False
+        if back is not None:
+            back.usable[_lead_to(back, moving)] = False
     seen: PlaneView | None = None
     # One cell for the whole run: that which suits the first basic pair, where that pair is connected.
     reference = (inputs.reference or inputs.level).meta
@@ -279,7 +293,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         inputs.left["level_0"],
         matches,
         inputs.right["level_0"] if inputs.right is not None else None,
-        _matches(inputs.back) if inputs.back is not None else None,
+        back,
     )
     low, high = z_range
     dem = reconstruct(matched, rig, T, lattice, (low, high), params.model_copy(update=NO_LIMIT))

@@ -64,6 +64,8 @@ def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> 
     centre : (3,) the camera's, m, in the frame of the lattice.
     side : of the windows, cells, whose mean slope counts.
     """
+    if min(elevation.shape) < 2:
+        return np.ones_like(elevation)
     ahead = [
         window_mean(np.gradient(elevation, at, axis=axis).astype(np.float32), side)
         for axis, at in ((1, lattice.xs()), (0, lattice.ys()))

@@ -38,7 +38,7 @@ class Recorded:
         about = {"georeference": None if place is None else place.to_dict()}
         (folder / "frames.json").write_text(json.dumps(about))
         poses = np.array([POSES[3].matrix34, np.full((3, 4), np.nan), POSES[5].matrix34, POSES[5].matrix34])
-        facts = {"frames": [3, 4, 5, 9], "main": 1}
+        facts = {"frames": [3, 4, 5, 9], "main": 1, "verticals": ["ground", "ground"]}
         self.made: dict[str, Bundle] = {
             "trajectory": Bundle({"poses": poses, "piece": np.array([1, -1, 1, 0], np.int16)}, facts),
             "calibration": Bundle({}, {"rig": RIG.to_dict()}),
