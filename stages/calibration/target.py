@@ -46,7 +46,6 @@ FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
 MAX_STEPS, SETTLED = 100, 1e-10
 """Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
-UNDETERMINED = "the views do not determine the cameras"
 MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
 )
@@ -160,6 +159,11 @@ def _enough(views: Sequence[BoardView]) -> None:
         )
 
 
+def _undetermined() -> DegenerateError:
+    remedy = f"{MORE_VIEWS}, or a model with fewer coefficients"
+    return DegenerateError("RIL-311", "the views do not determine the cameras", remedy=remedy)
+
+
 def _sides(T_right_left: RigidTransform) -> None:
     x = float(T_right_left.translation[0])
     if x > SWAPPED * float(np.linalg.norm(T_right_left.translation)):
@@ -219,9 +223,7 @@ class Adjustment:
             flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
             out = cv2.calibrateCamera(boards, flat, size, None, None, flags=flags)
         except cv2.error as error:
-            raise DegenerateError(
-                "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
-            ) from error
+            raise _undetermined() from error
         finally:
             cv2.setNumThreads(threads)
         _, k, d, rotations, translations = out
@@ -344,7 +346,7 @@ class Adjustment:
         scaled = jacobian / np.where(scale > 0, scale, 1.0)
         normal = scaled.T @ scaled
         if not scale.all() or np.linalg.cond(normal) > 1e15:
-            raise DegenerateError("RIL-313", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients")
+            raise _undetermined()
         variance = float(residual @ residual) / (residual.size - x.size)
         covariance = variance * np.linalg.inv(normal) / np.outer(scale, scale)
         deviation = np.sqrt(np.diag(covariance))
