@@ -128,8 +128,8 @@ class Bar(Lines):
 
 def summary(result: Result) -> str:
     """``12 computed, 388 cached in 14.2 s``, with what failed or was left out."""
-    total = result.total()
-    parts = [f"{total.computed} computed", f"{total.cached} cached"]
-    parts += [f"{n} {what}" for what, n in (("planned", total.planned), ("failed", total.failed)) if n]
-    parts += [f"{total.skipped} left out"] if total.skipped else []
+    counts = result.counts
+    parts = [f"{counts['computed']} computed", f"{counts['cached']} cached"]
+    parts += [f"{counts[status]} {status}" for status in ("planned", "failed") if counts[status]]
+    parts += [f"{counts['skipped']} left out"] if counts["skipped"] else []
     return f"{', '.join(parts)} in {result.seconds:.1f} s"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import Reads, RunView, there
+from rille.pipeline.export.view import Reads, RunView, artifact
 from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -25,12 +25,12 @@ from rille.stages.terrain.shading import hillshade, slope_deg
 GIS = "QGIS, GDAL"
 
 NODATA = {array.name: float(array.nodata or 0) for array in merge.merge_stage.outputs}
-"""Of the arrays of merged terrain."""
+"""Value of unknown cells by array of merged terrain."""
 
 
 def tiles_of(run: RunView) -> list[Bundle]:
     """World tiles of the merged terrain."""
-    return [there(run, tile) for tile in run.products.world_tiles]
+    return [artifact(run, tile) for tile in run.products.world_tiles]
 
 
 def whole(tiles: Sequence[Bundle], name: str) -> tuple[Lattice, NDArray[Any]]:
@@ -129,7 +129,7 @@ def _hazard(run: RunView) -> Raster:
 
 
 def _hazards(run: RunView) -> tuple[Lattice, Bundle]:
-    risk = there(run, run.products.world_risk)
+    risk = artifact(run, run.products.world_risk)
     return Lattice.from_dict(risk.meta["lattice"]), risk
 
 

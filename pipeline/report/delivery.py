@@ -146,20 +146,21 @@ def _failures(view: RunView) -> Items:
             # The figures in a message are those of one pair: the cause is the words.
             kind = _kind(root.label) if root.status == "failed" else ""
             causes.setdefault((kind, re.sub(r"-?[0-9][0-9.]*", "#", root.reason)), []).append(t)
-    items = []
-    for (kind, _), behind in causes.items():
-        failed = [t for t in behind if t.status == "failed"]
-        if not kind:
-            why = behind[0].reason or "something it depends on is missing"
-            items.append(_item("skipped", some([t.label for t in behind], 6), why))
-            continue
-        n, waiting = len(failed), len(behind) - len(failed)
-        whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
-        what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
-        if waiting:
-            what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
-        items.append(_item("failed", what, failed[0].reason))
-    return items
+    return [_failure(view, kind, behind) for (kind, _), behind in causes.items()]
+
+
+def _failure(view: RunView, kind: str, behind: list[TaskRow]) -> dict[str, str]:
+    """What one cause has cost: failed tasks of a ``kind`` (empty: none failed) and those that depend on them."""
+    if not kind:
+        why = behind[0].reason or "something it depends on is missing"
+        return _item("skipped", some([t.label for t in behind], 6), why)
+    failed = [t for t in behind if t.status == "failed"]
+    n, waiting = len(failed), len(behind) - len(failed)
+    whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
+    what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
+    if waiting:
+        what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
+    return _item("failed", what, failed[0].reason)
 
 
 def _kind(label: str) -> str:
@@ -194,7 +195,7 @@ def on_plane(view: RunView) -> bool:
 
 
 def _reference(view: RunView) -> Items:
-    """That nothing was asked of a vehicle, and why."""
+    """State that neither hazards nor paths were asked for, and why."""
     if not on_plane(view):
         return []
     first = facts_of(view, next(iter(view.products.level.values())))
@@ -271,7 +272,7 @@ def _truth(view: RunView) -> Items:
 
 
 def _vehicle(view: RunView) -> Items:
-    """That the limits are the defaults, of which each run knows for itself whether somebody stated them."""
+    """State that the vehicle's limits are the defaults; :func:`complete` keeps this where nobody has stated them."""
     v = view.config.vehicle
     if view.bundle(view.products.world_risk) is None:
         return []

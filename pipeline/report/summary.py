@@ -172,7 +172,7 @@ def _displaced(view: RunView) -> list[str]:
 
 def _imu(view: RunView) -> list[str]:
     """The IMU contradicts the images by its rotations, or it or a stated vertical the ground that they show."""
-    # Of the ground that was looked for: elevations may be measured from another plane.
+    # The ground also where elevations are measured from another plane.
     s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
     axes, lines = None if s.imu_axes is None else np.array(s.imu_axes), []
     if axes is not None and s.attitude is not None and trajectory is not None and s.times is not None:

@@ -56,7 +56,7 @@ class Area:
     within: Annotated[float | None, Parameter(validator=Number(gt=0))] = None
 
     def around(self) -> SearchArea | None:
-        """The same in numbers; None: everywhere.
+        """The area in numbers; None: everywhere.
 
         Raises
         ------
