@@ -58,6 +58,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.datasets.protocol import CAMERAS
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
@@ -511,7 +512,7 @@ def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
 
 def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
-    features = {(f, camera): make.features(f, camera) for f in whole for camera in ("left", "right")}
+    features = {(f, camera): make.features(f, camera) for f in whole for camera in CAMERAS}
     parts = [
         make.node(
             crosscheck_stage,

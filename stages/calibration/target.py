@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
@@ -114,15 +114,11 @@ def calibrate_rig(
 
     Raises
     ------
-    ConfigError
-        The model is unknown.
     DegenerateError
         There are too few views, or they do not determine the cameras.
     InputError
         The right camera stands on the left one's left.
     """
-    if model not in MODELS:
-        raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
     # A bounded loss sees no way from far off, and a fisheye's start is some pixels off.

@@ -142,6 +142,14 @@ def usable(image: Floats32, valid: AnyArray | None) -> Bools:
     return mask
 
 
+def levels_of(shape: tuple[int, ...], params: PyramidParams) -> int:
+    """Levels of the pyramid of an image of a shape."""
+    levels, side = 1, min(shape)
+    while levels < params.levels and side >= 2 * params.min_side:
+        levels, side = levels + 1, (side + 1) // 2
+    return levels
+
+
 def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None) -> Pyramid:
     """Pyramid of one grey image.
 
@@ -161,12 +169,10 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     black = frame(level, mask)
     if black is not None:
         mask &= ~black
-    levels, side = 1, min(level.shape)
-    while levels < params.levels and side >= 2 * params.min_side:
-        levels, side = levels + 1, (side + 1) // 2
     if not (image.dtype.kind == "u" and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    pyramid = halved(level, mask.view(np.uint8), levels, MIN_VALID if black is None else MIN_VALID_AT_FRAME)
+    least = MIN_VALID if black is None else MIN_VALID_AT_FRAME
+    pyramid = halved(level, mask.view(np.uint8), levels_of(level.shape, params), least)
     return Pyramid(pyramid.images, pyramid.valid, noise.standard_deviation(pyramid.images, pyramid.valid))
 
 

@@ -417,8 +417,6 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
     assert capsys.readouterr() == ("", "")
 
 
-def test_unknown_modes_and_no_workers_are_refused(cache):
-    with raises("RIL-568"):
-        progress.make("loud")
+def test_no_workers_are_refused(cache):
     with raises("RIL-540"):
         run(cache, jobs=0)
