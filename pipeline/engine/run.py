@@ -85,7 +85,6 @@ class Result:
     unknown: list[str] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
-    workers_started: bool = False
     interrupted: bool = False
 
     @property
@@ -346,7 +345,6 @@ class _Run:
         jobs = self.budget.workers(self.largest)
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
-        self.result.workers_started = True
         if not self.options.kept:
             return make(kind, jobs, self.store.root, self.budget.limit)
         workers = self.options.kept.pop()

@@ -157,7 +157,7 @@ def check(kind: Any, jobs: int | None = None) -> None:
         if not isinstance(kind, Client) or kind.scheduler is None or kind.asynchronous:
             text = f"{kind!r} is no open Client of dask, or an asynchronous one"
             raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
-    if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
+    elif kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
     at_work = {frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(inspect.currentframe())}

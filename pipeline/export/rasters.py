@@ -49,20 +49,20 @@ def _dem(run: RunView) -> Raster:
     """Elevations, or heights where the sequence has a place, m."""
     (lattice, elevation), place = whole(tiles_of(run), "elevation"), run.sequence.georeference
     height = elevation if place is None else elevation.astype(np.float64) + place.origin[2]
-    return lattice, {"elevation": height}, Meaning("m", tags=above(run))
+    return lattice, {"elevation": height}, Meaning("m", tags=plane_tag(run))
 
 
 def _sigma(run: RunView) -> Raster:
     lattice, sigma = whole(tiles_of(run), "elevation_std")
-    return lattice, {"elevation_std": sigma}, Meaning("m", tags=above(run))
+    return lattice, {"elevation_std": sigma}, Meaning("m", tags=plane_tag(run))
 
 
 def _slope(run: RunView) -> Raster:
     lattice, elevation = whole(tiles_of(run), "elevation")
-    return lattice, {"slope": slope_deg(elevation, lattice.cell)}, Meaning("degree", tags=above(run))
+    return lattice, {"slope": slope_deg(elevation, lattice.cell)}, Meaning("degree", tags=plane_tag(run))
 
 
-def above(run: RunView) -> dict[str, str]:
+def plane_tag(run: RunView) -> dict[str, str]:
     """The frame of merged terrain in words, where its elevations are distances from a plane that is no ground."""
     return {"frame": ON_PLANE} if any("reference" in tile.meta for tile in tiles_of(run)) else {}
 

@@ -90,7 +90,7 @@ def has_truth(view: RunView) -> list[bool]:
     return [truth is not None and truth[frame] is not None for frame in view.frames]
 
 
-def which(frames: list[int]) -> str:
+def frame_words(frames: list[int]) -> str:
     """``frames 1-3, 7``."""
     return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
 
@@ -172,11 +172,11 @@ def _poses(frames: Rows) -> Items:
     items = []
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
-        items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which(lost)))
+        items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", frame_words(lost)))
     apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
     if apart:
         what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
-        items.append(_item("piece", what, which(apart)))
+        items.append(_item("piece", what, frame_words(apart)))
     return items
 
 
@@ -185,7 +185,7 @@ def _local_paths(pairs: Rows) -> Items:
     reached, asked = local_paths(pairs)
     without = [r for r in pairs if r["path"] not in (None, "found")]
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in [r["path"] for r in without]}
-    why = "; ".join(f"{reason} ({which(frames)})" for reason, frames in at.items())
+    why = "; ".join(f"{reason} ({frame_words(frames)})" for reason, frames in at.items())
     return [_item("no local path", f"No local path from {asked - reached} of {asked} stops", why)] if why else []
 
 
@@ -263,7 +263,7 @@ def _truth(view: RunView) -> Items:
         return []
     if any(known):
         gaps = [frame for frame, there in zip(view.frames, known, strict=True) if not there]
-        return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", which(gaps))]
+        return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", frame_words(gaps))]
     none = view.sequence.truth is None and view.sequence.truth_positions is None
     owner = "the sequence has none" if none else "it has none for the chosen frames"
     if view.products.disparity_accuracy:
@@ -300,7 +300,7 @@ def _crosscheck_lost(scene: Scene) -> Items:
     if not lost:
         return []
     meta = facts_of(view, view.products.crosscheck)
-    reasons = [f"COLMAP has no pose of {which(lost)}"]
+    reasons = [f"COLMAP has no pose of {frame_words(lost)}"]
     if len(meta.get("pieces") or ()) > 1:
         reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")
     reasons += meta.get("reasons") or ()

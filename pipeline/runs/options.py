@@ -158,7 +158,7 @@ def cache_folder(given: str | Path | None) -> Path:
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
-def named(output: Path, ending: str) -> Path:
+def output_file(output: Path, ending: str) -> Path:
     """The file with this ending, of an output of several files: its name has no ending, or that of one of them."""
     return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
 

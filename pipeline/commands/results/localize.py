@@ -25,7 +25,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import write_trajectory_tum
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
+from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.place import place
@@ -167,7 +167,7 @@ def localize(
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    written = [named(output, ".json")]
+    written = [output_file(output, ".json")]
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else for_file(found))}
     atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
@@ -219,13 +219,13 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
 
 def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store) -> Iterator[Path]:
     """Write trajectory and path in the map's coordinates; gives the files."""
-    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {named(output, '.json').name}"
+    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {output_file(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
         known = api.Run(folder).trajectory
         turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
         poses = np.concatenate([turned, there[..., None]], axis=2)
-        write_trajectory_tum(named(output, ".tum"), poses, known["time"].values.tolist(), words)
-        yield named(output, ".tum")
+        write_trajectory_tum(output_file(output, ".tum"), poses, known["time"].values.tolist(), words)
+        yield output_file(output, ".tum")
     try:
         with lookup.reading(folder):
             planned = RunArtifacts(folder, store).find("path/world")
@@ -235,5 +235,5 @@ def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store
     if planned is not None:
         moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
         frame = Georeference(crs, (0.0, 0.0, 0.0), 0.0) if crs else None
-        write_path(named(output, ".gpkg"), moved, frame)
-        yield named(output, ".gpkg")
+        write_path(output_file(output, ".gpkg"), moved, frame)
+        yield output_file(output, ".gpkg")
