@@ -39,7 +39,7 @@ COVERS = np.linspace(0.02, 0.15, 17)
 LONGEST = 240
 """Seconds of a run, after which it counts as one that hangs."""
 
-INTERNAL = re.compile(r"RIL-999|RIL-534|RIL-535|RIL-581|Traceback")
+INTERNAL = re.compile(r"RIL-999|RIL-534|RIL-577|RIL-581|Traceback")
 OWN = "DegenerateError InputError"
 """Errors by which a stage says that its input does not determine its result."""
 

@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,8 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     begin = time.perf_counter()
     result = run(graph, Store(cache), RunOptions(jobs=jobs, ledger=ledger))
     result.check()
-    counts = {name: (c.computed, c.cached) for name, c in result.counts.items()}
-    print(f"{time.perf_counter() - begin:.0f} s, computed and cached: {counts}", flush=True)
+    counts = dict(Counter(f"{h.stage} {h.status}" for h in graph.nodes))
+    print(f"{time.perf_counter() - begin:.0f} s, {counts}", flush=True)
     return {h.label: h.ref.digest for h in graph.nodes if h.stage == "merge" and h.ref is not None}
 
 

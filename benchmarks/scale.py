@@ -290,7 +290,7 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     processor = sum(h.took.kernel for h in graph.nodes)
     return {
         "nodes": n,
-        "computed": result.total().computed,
+        "computed": result.counts["computed"],
         "wall": 1e3 * spent / n,
         "client": 1e3 * cpu / n,
         "overhead": 1e3 * (cpu + sum(watch.processor.values()) - processor) / n,

@@ -45,7 +45,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         text = f"the images of {sequence.name} have lens distortion, which calib.txt cannot say"
         raise InputError("RIL-184", text, remedy="export a sequence without; this one is plain files already")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError("RIL-165", f"{directory} is not empty", remedy="name a folder that does not exist yet")
+        raise InputError("RIL-165", f"{directory} exists, and is no empty folder", remedy="name another")
     chosen = tuple(
         range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1))) if pairs is None else pairs
     )

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import webbrowser
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import tomli_w
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import xarray
 
 AXES = ("x", "y", "z")
+T = TypeVar("T")
 Settings = Mapping[str, Any]
 
 
@@ -199,14 +200,12 @@ class Run:
 
         A drive is complete where it reached its goal.
         """
-        with self._reading():
-            return bool(self.report["complete"])
+        return self._fact("complete", bool)
 
     @property
     def missing(self) -> list[Mapping[str, str]]:
         """What could not be delivered: of each ``what`` it is, ``why``, and its ``kind``, a word for programs."""
-        with self._reading():
-            return list(self.report["missing"])
+        return self._fact("missing", list)
 
     @property
     def tasks(self) -> list[Mapping[str, Any]]:
@@ -223,8 +222,7 @@ class Run:
     @property
     def metrics(self) -> Mapping[str, Any]:
         """Figures by name: each has ``value``, ``unit`` and ``how`` it is found."""
-        with self._reading():
-            return dict(self.report["metrics"])
+        return self._fact("metrics", dict)
 
     @property
     def terrain(self) -> xarray.Dataset:
@@ -296,6 +294,10 @@ class Run:
     def show(self) -> None:
         """Open the report in the web browser."""
         webbrowser.open(self.file("report.html").resolve().as_uri())
+
+    def _fact(self, name: str, kind: Callable[[Any], T]) -> T:
+        with self._reading():
+            return kind(self.report[name])
 
     def _reading(self) -> AbstractContextManager[None]:
         from rille.pipeline.runs import lookup

@@ -113,7 +113,7 @@ def prepare() -> None:
 
 def _run(argv: list[str] | None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
-    # Of every command, and asked of the words: an error may come before a command is known.
+    # Every command takes it; looked for here, for an error may come before a command is known.
     tokens, debug = [word for word in given if word != "--debug"], "--debug" in given
     try:
         prepare()

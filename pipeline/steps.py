@@ -539,7 +539,7 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     from rille.pipeline.flow import config
 
     settings: dict[str, Any] = {}
-    # What the step before was given goes before what suits the sequence, and what is given now before both.
+    # The last wins: what suits the sequence, what the step before was given, what is given now.
     for layer in (*more[:-1], _settings(data), more[-1]):
         config.merge(settings, layer)
     return settings

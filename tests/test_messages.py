@@ -67,8 +67,7 @@ def messages(tree: ast.Module) -> Iterator[tuple[str, str, str]]:
         if isinstance(call.func, ast.Attribute) and call.func.attr == "error":  # code, key, what, remedy
             yield str(code.value), f"…: {words(told[0], names)} {words(told[1], names)}", words((*told, None)[2], names)
         else:
-            reason = ": …" if ast.unparse(call.func) == "reported" else ""
-            yield str(code.value), words(told[0], names) + reason, words(remedy, names)
+            yield str(code.value), words(told[0], names), words(remedy, names)
 
 
 def page() -> str:

@@ -154,7 +154,7 @@ def edited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     folder = tmp_path_factory.mktemp("sources")
     for package in ("stages", "datasets", "pipeline"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = (code_digest._read, code_digest._file, code_digest._reachable, spec._shared)
+    caches = (code_digest._read, code_digest._file, code_digest.module_digests, spec._shared, spec._shared_digest)
 
     @contextmanager
     def edit(module: str, change: Callable[[str], str]) -> Iterator[None]:

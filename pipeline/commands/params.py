@@ -13,10 +13,9 @@ from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.pipeline.flow import config
-from rille.pipeline.runs import lookup
+from rille.pipeline.runs.lookup import refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, FLAG
 from rille.stages.core.declare import Params
-from rille.stages.core.errors import ConfigError
 
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
@@ -32,9 +31,8 @@ def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> int
         As tables of Markdown.
     """
     known = sections()
-    if section and section not in known:
-        hint = lookup.near(section, known) or f"one of {', '.join(sorted(known))}"
-        raise ConfigError("RIL-920", f"there is no section {section!r}", remedy=hint)
+    if section:
+        refuse_unknown("params", [section], known, "section")
     chosen = {section: known[section]} if section else known
     print("\n".join(page(chosen) if markdown else plain(chosen)))
     return COMPLETE

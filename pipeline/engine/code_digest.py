@@ -91,15 +91,32 @@ def package_of(module: str) -> str:
     return ".".join(module.split(".")[: 2 if module.startswith("rille.") else 1])
 
 
+@cache
 def module_digests(module: str) -> dict[str, str]:
-    """Digest of each own module that ``module`` reaches, itself included, by dotted name.
+    """Digest of each own module that ``module`` reaches, itself included, by dotted name, in order.
 
     Raises
     ------
     ModuleNotFoundError
         ``module`` itself has no source file.
     """
-    return dict(_reachable(module))
+    own = {*OWN, package_of(module)}
+    if _file(module) is None:
+        raise ModuleNotFoundError(f"module {module} has no source file", name=module)
+    found: dict[str, str] = {}
+    queue = [module]
+    while queue:
+        name = queue.pop()
+        # The package first: of modules of others no file is looked for.
+        if name in found or package_of(name) not in own or (path := _file(name)) is None:
+            continue
+        source = _read(name, path)
+        found[name] = source.sha256
+        queue += source.imports
+        found |= _other_languages(name, path)
+        # Importing a module runs the __init__ of every package above it.
+        queue += _parents(name)
+    return dict(sorted(found.items()))
 
 
 @cache
@@ -130,32 +147,11 @@ def external_imports(module: str) -> set[str]:
     own = {*OWN, package_of(module)}
     return {
         imported.partition(".")[0]
-        for name, _ in _reachable(module)
+        for name in module_digests(module)
         if (path := _file(name)) is not None
         for imported in _read(name, path).imports
         if package_of(imported) not in own and imported.partition(".")[0] not in sys.stdlib_module_names
     }
-
-
-@cache
-def _reachable(module: str) -> tuple[tuple[str, str], ...]:
-    own = {*OWN, package_of(module)}
-    if _file(module) is None:
-        raise ModuleNotFoundError(f"module {module} has no source file", name=module)
-    found: dict[str, str] = {}
-    queue = [module]
-    while queue:
-        name = queue.pop()
-        # The package first: of modules of others no file is looked for.
-        if name in found or package_of(name) not in own or (path := _file(name)) is None:
-            continue
-        source = _read(name, path)
-        found[name] = source.sha256
-        queue += source.imports
-        found |= _other_languages(name, path)
-        # Importing a module runs the __init__ of every package above it.
-        queue += _parents(name)
-    return tuple(sorted(found.items()))
 
 
 def _other_languages(name: str, path: Path) -> dict[str, str]:

@@ -19,13 +19,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Generic, cast
+from typing import Any, Generic, NamedTuple, cast
 
 from rille.pipeline.engine.spec import Refs, Spec, each, flat
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import F, Params, Stage
-
-Expansion = Callable[..., None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +108,14 @@ class Maybe:
     handles: Sequence[Handle]
 
 
+class Waiting(NamedTuple):
+    """A flow that waits for handles: ``go_on`` takes their references, with ``holes`` None of those that failed."""
+
+    handles: list[Handle]
+    go_on: Callable[..., None]
+    holes: bool
+
+
 class Complete(frozenset[str]):
     """Names of stages of which a flow will not lay out any more tasks: where nothing else is wanted, it ends there."""
 
@@ -153,7 +159,7 @@ def first_label(label: str) -> str:
 
 @dataclass
 class Graph:
-    """Nodes in order of creation, and expansions that wait for some of them.
+    """Nodes in order of creation, and flows that wait for some of them (``expansions``).
 
     Attributes
     ----------
@@ -169,7 +175,7 @@ class Graph:
     sequence: str = ""
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
-    expansions: list[tuple[list[Handle], Expansion, bool]] = field(default_factory=list)
+    expansions: list[Waiting] = field(default_factory=list)
     last: Callable[[], None] | None = None
     cut: Cut | None = None
     asked: set[int] = field(default_factory=set)
@@ -254,7 +260,8 @@ class Graph:
             wanted = self._wait(steps, step)
         except MissingError as error:
             self.unfinished -= 1
-            self.expansions.append((error.handles, lambda *_: None, False))  # the run's end says what it waited for
+            # Never to go on: the run's end says what it waited for.
+            self.expansions.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
         if wanted is None or idle:
             self.unfinished -= 1
@@ -270,11 +277,11 @@ class Graph:
             else:
                 self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        self.expansions.append((handles, resume, True))
+        self.expansions.append(Waiting(handles, resume, holes=True))
 
 
 _NONE: dict[str, Any] = {}
-"""One for all: an empty dictionary takes 64 bytes."""
+"""Shared by all nodes without arguments: an empty dictionary takes 64 bytes."""
 
 
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:

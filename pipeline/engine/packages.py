@@ -48,7 +48,7 @@ def versions(module: str) -> dict[str, str]:
     MissingPackageError
         One of them is not installed.
     """
-    # What checks parameters, whose values are part of a key themselves; the engine, whose format is; and types
+    # Without what checks parameters, whose values are in the key, the engine, whose format is, and types
     names = external_imports(module) - frozenset({"pydantic", "rille", "typing_extensions"})
     if "numba" in names:
         names.add("llvmlite")  # generates the code

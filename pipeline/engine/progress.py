@@ -11,7 +11,6 @@ import time
 from typing import TYPE_CHECKING, TextIO
 
 from rille.pipeline.engine.plain import plain, raw
-from rille.stages.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Graph, Handle
@@ -27,8 +26,6 @@ def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
     if mode == "auto":
         mode = "bar" if stream.isatty() else "plain"
     kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
-    if mode not in kinds:
-        raise ConfigError("RIL-568", f"progress {mode!r} is unknown", remedy=f"one of auto, {', '.join(kinds)}")
     return kinds[mode](stream)
 
 
@@ -70,16 +67,16 @@ class Lines(Progress):
         self.shown = time.monotonic()
 
     def resolved(self, handle: Handle) -> None:
-        """Say where we are, now and then, and at once what was compiled."""
+        """Say at once what was compiled, and show where the run is."""
         super().resolved(handle)
-        self._compiled(handle)
+        if handle.took.compiling >= 1.0:
+            self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
+        self._show(handle)
+
+    def _show(self, handle: Handle) -> None:
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
             self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}")
-
-    def _compiled(self, handle: Handle) -> None:
-        if handle.took.compiling >= 1.0:
-            self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
@@ -109,10 +106,7 @@ class Bar(Lines):
         self.task = self.rich.add_task("", total=None)
         self.rich.start()
 
-    def resolved(self, handle: Handle) -> None:
-        """Move the bar, and name what has ended last."""
-        Progress.resolved(self, handle)
-        self._compiled(handle)
+    def _show(self, handle: Handle) -> None:
         self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(handle.label))
 
     def close(self, result: Result) -> None:
@@ -128,8 +122,8 @@ class Bar(Lines):
 
 def summary(result: Result) -> str:
     """``12 computed, 388 cached in 14.2 s``, with what failed or was left out."""
-    total = result.total()
-    parts = [f"{total.computed} computed", f"{total.cached} cached"]
-    parts += [f"{n} {what}" for what, n in (("planned", total.planned), ("failed", total.failed)) if n]
-    parts += [f"{total.skipped} left out"] if total.skipped else []
+    counts = result.counts
+    parts = [f"{counts['computed']} computed", f"{counts['cached']} cached"]
+    parts += [f"{counts[status]} {status}" for status in ("planned", "failed") if counts[status]]
+    parts += [f"{counts['skipped']} left out"] if counts["skipped"] else []
     return f"{', '.join(parts)} in {result.seconds:.1f} s"

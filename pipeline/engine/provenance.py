@@ -51,7 +51,7 @@ class History:
 
     @cached_property
     def _others(self) -> list[Keys]:
-        """Of other choices of frames, the newest first."""
+        """Keys of runs with other choices of frames, the newest first."""
         found = [p for p in self._path.parent.glob("keys-*.json") if p != self._path]
         with suppress(OSError):  # one was removed just now
             return [_read(p) for p in sorted(found, key=os.path.getmtime, reverse=True)]

@@ -2,7 +2,7 @@
 
 >>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
->>> result.counts["locus"].cached
+>>> result.counts["cached"]
 8
 
 Nodes are taken in the order of their creation. One whose inputs are there has a key, and is looked up; one whose inputs
@@ -27,22 +27,22 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Expansion, Graph, Handle
+from rille.pipeline.engine.graph import Graph, Handle, Waiting
 from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.spec import Refs, each, key_of, recipe
-from rille.pipeline.engine.store.base import GoneError, NonDeterministicError, Store
+from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import CodeChangedError, Outcome
+from rille.pipeline.engine.task import Outcome, code_changed
 from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
 from rille.stages.core.errors import DegenerateError, RilleError
 
@@ -62,53 +62,35 @@ class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
 
 
-@dataclass
-class Counts:
-    """Number of nodes of one stage by outcome; ``seconds`` is the sum over those computed now."""
-
-    computed: int = 0
-    cached: int = 0
-    failed: int = 0
-    skipped: int = 0
-    planned: int = 0
-    seconds: float = 0.0
-
-
 @dataclass(frozen=True)
 class Failure:
-    """A task that failed: its label and stage, the original exception and the text of its traceback."""
+    """A task that failed: its label and stage, and the original exception."""
 
     label: str
     stage: str
     error: BaseException
-    traceback: str
 
 
 @dataclass
 class Result:
-    """Outcome of a run.
+    """Outcome of a run; ``counts`` are numbers of nodes by their status.
 
     Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
     hide it. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
     """
 
-    counts: dict[str, Counts] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
     failures: list[Failure] = field(default_factory=list)
     assumed: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
-    workers_started: bool = False
     interrupted: bool = False
 
     @property
     def ok(self) -> bool:
         """Whether it came to its end, nothing failed and nothing was left out."""
-        return not self.interrupted and not self.failures and not any(c.skipped for c in self.counts.values())
-
-    def total(self) -> Counts:
-        """Counts over all stages."""
-        return Counts(**{f.name: sum(getattr(c, f.name) for c in self.counts.values()) for f in fields(Counts)})
+        return not self.interrupted and not self.failures and not self.counts["skipped"]
 
     def check(self, *, holes: bool = False) -> None:
         """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
@@ -225,7 +207,7 @@ class _Run:
             if not self.dry:
                 self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
         finally:
-            self._count()
+            self.result.counts.update(h.status for h in self.graph.nodes)
             if not self.dry:
                 self.history.save(self.graph.nodes)
             self.result.seconds = time.perf_counter() - begin
@@ -270,7 +252,7 @@ class _Run:
         if cut is None:
             return
         wanted = [h for h in nodes[self.seen :] if cut.wants(h)]
-        wanted += [h for handles, *_ in self.graph.expansions for h in handles]
+        wanted += [h for waiting in self.graph.expansions for h in waiting.handles]
         self.seen = len(nodes)
         while wanted:
             handle = wanted.pop()
@@ -365,7 +347,6 @@ class _Run:
         jobs = self.budget.workers(self.largest)
         name = kind if isinstance(kind, str) else kind.scheduler.address
         self.ledger.run(executor=name, jobs=jobs)
-        self.result.workers_started = True
         if not self.options.kept:
             return make(kind, jobs, self.store.root, self.budget.limit)
         workers = self.options.kept.pop()
@@ -411,14 +392,12 @@ class _Run:
                 self._explain(handle, refs)
         # The worker computed the key from its own source files: they were edited during the run, or differ there.
         if handle.key not in ("", outcome.ref.key):
-            changed = CodeChangedError("RIL-870", "a worker's source code is not that of this process")
-            self._fail(handle, Failed(changed))
+            self._fail(handle, Failed(code_changed()))
             return
         if self.before.get(handle.index, outcome.ref.digest) != outcome.ref.digest:
-            text = f"stage {handle.stage} is not deterministic: another digest when healed"
-            self._fail(handle, Failed(NonDeterministicError("RIL-535", text)))
+            self._fail(handle, Failed(not_deterministic(handle.stage, handle.label)))
             return
-        # What is unpickled brings names of its own each time.
+        # Unpickling makes a new object of each name: one for all saves memory.
         handle.took = replace(outcome.took, worker=sys.intern(outcome.took.worker))
         handle.ref, handle.key = replace(outcome.ref, stage=handle.stage), outcome.ref.key
         self._resolve(handle, "cached" if outcome.cached else "computed")
@@ -450,9 +429,11 @@ class _Run:
 
     def _fail(self, handle: Handle, failed: Failed) -> None:
         handle.error, handle.ref = failed.error, None
+        if failed.error.__traceback__ is None and failed.traceback:  # from a worker: --debug prints notes
+            failed.error.add_note(failed.traceback)
         handle.reason = f"{type(failed.error).__name__}: {failed.error}"
         self._resolve(handle, "failed")
-        self._failed(Failure(handle.label, handle.stage, failed.error, failed.traceback))
+        self._failed(Failure(handle.label, handle.stage, failed.error))
 
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
@@ -470,10 +451,11 @@ class _Run:
         """Go on with the first flow whose handles are done, or lay out what comes last; whether there was such."""
         if self.stopped or self.suspects:
             return False
-        for i, (handles, flow, holes) in enumerate(self.graph.expansions):
-            if all(h.done or h.earlier or (holes and h.status in ("failed", "skipped")) for h in handles):
+        for i, waiting in enumerate(self.graph.expansions):
+            lost = ("failed", "skipped") if waiting.holes else ()
+            if all(h.done or h.earlier or h.status in lost for h in waiting.handles):
                 del self.graph.expansions[i]
-                self._expand(handles, flow)
+                self._expand(waiting)
                 self._ask()
                 return True
         last = self.graph.last
@@ -484,20 +466,20 @@ class _Run:
         self._ask()
         return True
 
-    def _expand(self, handles: list[Handle], flow: Expansion) -> None:
-        assumed = [h.label for h in handles if h.earlier and not h.done]
+    def _expand(self, waiting: Waiting) -> None:
+        assumed = [h.label for h in waiting.handles if h.earlier and not h.done]
         self.result.assumed += assumed
         try:
-            flow(*(h.ref or h.earlier for h in handles))
+            waiting.go_on(*(h.ref or h.earlier for h in waiting.handles))
         except BrokenPipeError:  # who read what the flow prints has had enough of it
             raise
         except Exception as error:
             if assumed:  # what was found with other parameters or images does not fit: no more can be said
                 self.result.unknown += assumed
             else:
-                label = f"plan after {_labels(handles)}"
+                label = f"plan after {_labels(waiting.handles)}"
                 self.ledger.note(label, "failed", f"{type(error).__name__}: {error}")
-                self._failed(Failure(label, "", error, Failed.of(error).traceback))
+                self._failed(Failure(label, "", error))
 
     def _leave_out(self) -> None:
         """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for, and
@@ -507,9 +489,9 @@ class _Run:
             self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.asked]
         for handle in self.graph.nodes:
             if handle.status == "pending":
-                missing = next((h for h in handle.upstream() if h.status in MISSING), None)
-                if missing is not None:
-                    self._skip(handle, missing)
+                lost = next((h for h in handle.upstream() if h.status in MISSING), None)
+                if lost is not None:
+                    self._skip(handle, lost)
                 else:
                     handle.reason = self.stopped
                     self._resolve(handle, "skipped")
@@ -517,17 +499,11 @@ class _Run:
         labels = {h.label for h in self.graph.nodes if h.index in lost}
         self.graph.nodes[:] = [h for h in self.graph.nodes if h.index not in lost]
         self.result.failures = [f for f in self.result.failures if f.label not in labels]
-        for handles, *_ in self.graph.expansions:
-            waits = [h for h in handles if not h.done]
-            self.result.unknown += [h.label for h in waits]
-            self.ledger.note(f"plan after {_labels(handles)}", "planned" if self.dry else "skipped", _labels(waits))
-
-    def _count(self) -> None:
-        for handle in self.graph.nodes:
-            counts = self.result.counts.setdefault(handle.stage, Counts())
-            if handle.status != "pending":
-                setattr(counts, handle.status, getattr(counts, handle.status) + 1)
-                counts.seconds += handle.took.seconds
+        for waiting in self.graph.expansions:
+            missing = [h for h in waiting.handles if not h.done]
+            self.result.unknown += [h.label for h in missing]
+            status = "planned" if self.dry else "skipped"
+            self.ledger.note(f"plan after {_labels(waiting.handles)}", status, _labels(missing))
 
 
 def _given(handle: Handle) -> Ref | int:

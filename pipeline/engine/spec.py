@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from rille.pipeline.engine.code_digest import module_digests
@@ -73,25 +74,25 @@ def resolve(module: str) -> Stage:
 
 def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
     """All that determines a result, by name."""
-    return {**_shared(spec.module)[0], **_own(spec, refs)}
+    return {**_shared(spec.module), **_own(spec, refs)}
 
 
 def key_of(spec: Spec, refs: Refs) -> str:
     """Key of a task: the digest of its recipe, in which one digest stands for what all tasks of a stage share."""
-    return digest({"stage": _shared(spec.module)[1], **_own(spec, refs)}, spec.label)
+    return digest({"stage": _shared_digest(spec.module), **_own(spec, refs)}, spec.label)
 
 
 def _own(spec: Spec, refs: Refs) -> dict[str, Any]:
-    return {"params": spec.params, "args": dict(spec.args), "inputs": each(_digest, refs)}
+    return {"params": spec.params, "args": dict(spec.args), "inputs": each(attrgetter("digest"), refs)}
 
 
 @cache
-def _shared(module: str) -> tuple[dict[str, Any], str]:
-    """What all tasks of a stage have in common, and the digest of it."""
+def _shared(module: str) -> dict[str, Any]:
+    """What all tasks of a stage have in common."""
     stage, code, env = resolve(module), module_digests(module), versions(module)
-    parts = {"code": code, "env": env, "format": FORMAT, "stage": stage.name, "version": stage.version}
-    return parts, digest(parts, module)
+    return {"code": code, "env": env, "format": FORMAT, "stage": stage.name, "version": stage.version}
 
 
-def _digest(ref: Ref) -> str:
-    return ref.digest
+@cache
+def _shared_digest(module: str) -> str:
+    return digest(_shared(module), module)

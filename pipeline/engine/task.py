@@ -32,6 +32,12 @@ class CodeChangedError(RilleError):
     """The source code or the packages of a worker are not those of the client."""
 
 
+def code_changed() -> CodeChangedError:
+    """The error of a task whose key is another one on the worker."""
+    text = "source code or packages of the worker are not those the run began with"
+    return CodeChangedError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Outcome of a task: its artifact, whether it was cached, and what it took."""
@@ -51,8 +57,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     # Computed here as well, from this process's own source files: the client's may be newer.
     own = key_of(spec, refs)
     if key is not None and key != own:
-        text = f"{spec.label}: source code or packages of the worker are not those the run began with"
-        raise CodeChangedError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
+        raise code_changed()
     store = Store(root)
     for trial in range(TRIES):
         try:

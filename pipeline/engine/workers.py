@@ -157,7 +157,7 @@ def check(kind: Any, jobs: int | None = None) -> None:
         if not isinstance(kind, Client) or kind.scheduler is None or kind.asynchronous:
             text = f"{kind!r} is no open Client of dask, or an asynchronous one"
             raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
-    if isinstance(kind, str) and kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
+    elif kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
     # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
     at_work = {frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(inspect.currentframe())}
@@ -344,7 +344,7 @@ class Dask:
         with suppress(queue.Empty):
             while True:
                 number, name, outcome = pickle.loads(self._events.get(timeout=0 if ended else timeout))
-                # Of another name: it ran again because its worker died after it had said so.
+                # Another name is that of an earlier try, whose worker died after it had sent this.
                 if number in self._futures and self._futures[number].key == name:
                     self._leaving.append(self._futures.pop(number))
                     ended.append((number, outcome))
@@ -359,7 +359,7 @@ class Dask:
         error = future.exception()
         if not isinstance(error, KilledWorker):  # it could not even be unpickled there
             return Failed.of(error)
-        # One that it waited for is named there by its own name.
+        # The task that killed its workers may be one that this one waited for.
         return self._died(error) if str(error.task) == future.key else NotBegun()
 
     def _died(self, error: Any) -> Died:
@@ -444,7 +444,7 @@ class Dask:
 
 
 Workers = Inline | Dask
-"""They run calls, each known by its number, the least first."""
+"""What runs calls: each is known by its number, and the least runs first."""
 
 
 async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:

@@ -39,9 +39,12 @@ OUTPUTS = (
     Output("ledger.jsonl", "what became of every task, a JSON object a line", "any text editor, jq"),
 )
 
+RENDERED = frozenset(output.name for output in OUTPUTS if output.write is None)
+"""Files that each run writes anew, for they say when and where it was: with equal results they differ all the same."""
+
 
 def listed(folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Name, meaning and programs of all that a run's folder holds, others than these behind."""
+    """Name, meaning and programs of all that a run's folder holds; files that are none of a run last, by name alone."""
     # The page lists itself, though it is written only after its list.
     left = {p.name for p in folder.iterdir() if not p.name.startswith(".")} | {"report.html", "report.json"}
     for output in OUTPUTS:

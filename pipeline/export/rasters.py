@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import Reads, RunView, there
+from rille.pipeline.export.view import Reads, RunView, artifact
 from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -25,12 +25,12 @@ from rille.stages.terrain.shading import hillshade, slope_deg
 GIS = "QGIS, GDAL"
 
 NODATA = {array.name: float(array.nodata or 0) for array in merge.merge_stage.outputs}
-"""Of the arrays of merged terrain."""
+"""Value of unknown cells by array of merged terrain."""
 
 
 def tiles_of(run: RunView) -> list[Bundle]:
     """World tiles of the merged terrain."""
-    return [there(run, tile) for tile in run.products.world_tiles]
+    return [artifact(run, tile) for tile in run.products.world_tiles]
 
 
 def whole(tiles: Sequence[Bundle], name: str) -> tuple[Lattice, NDArray[Any]]:
@@ -49,20 +49,20 @@ def _dem(run: RunView) -> Raster:
     """Elevations, or heights where the sequence has a place, m."""
     (lattice, elevation), place = whole(tiles_of(run), "elevation"), run.sequence.georeference
     height = elevation if place is None else elevation.astype(np.float64) + place.origin[2]
-    return lattice, {"elevation": height}, Meaning("m", tags=above(run))
+    return lattice, {"elevation": height}, Meaning("m", tags=plane_tag(run))
 
 
 def _sigma(run: RunView) -> Raster:
     lattice, sigma = whole(tiles_of(run), "elevation_std")
-    return lattice, {"elevation_std": sigma}, Meaning("m", tags=above(run))
+    return lattice, {"elevation_std": sigma}, Meaning("m", tags=plane_tag(run))
 
 
 def _slope(run: RunView) -> Raster:
     lattice, elevation = whole(tiles_of(run), "elevation")
-    return lattice, {"slope": slope_deg(elevation, lattice.cell)}, Meaning("degree", tags=above(run))
+    return lattice, {"slope": slope_deg(elevation, lattice.cell)}, Meaning("degree", tags=plane_tag(run))
 
 
-def above(run: RunView) -> dict[str, str]:
+def plane_tag(run: RunView) -> dict[str, str]:
     """The frame of merged terrain in words, where its elevations are distances from a plane that is no ground."""
     return {"frame": ON_PLANE} if any("reference" in tile.meta for tile in tiles_of(run)) else {}
 
@@ -129,7 +129,7 @@ def _hazard(run: RunView) -> Raster:
 
 
 def _hazards(run: RunView) -> tuple[Lattice, Bundle]:
-    risk = there(run, run.products.world_risk)
+    risk = artifact(run, run.products.world_risk)
     return Lattice.from_dict(risk.meta["lattice"]), risk
 
 

@@ -32,7 +32,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.terrain.relief.grid import Grid
 
 MAX_CELLS = 500_000_000
-"""Of an elevation model, which is read whole."""
+"""Most cells of an elevation model, which is read whole."""
 
 OURS = "give a run as Rille writes it"
 
@@ -91,10 +91,14 @@ def read_elevation(path: Path) -> DemFile:
         remedy = "give a GeoTIFF or ESRI ASCII grid, or the folder of a run"
         raise InputError("RIL-627", f"{path} does not exist", remedy=remedy)
     dem = _without_marks(_of_run(path) if path.is_dir() else read_raster(path))
-    if not np.isfinite(dem.grid.values).any():
-        text = f"{path} has no known cell among {dem.grid.values.size}"
-        raise InputError("RIL-628", text, remedy="give another elevation model")
+    _check_known(path, dem.grid)
     return dem
+
+
+def _check_known(path: Path, grid: Grid) -> None:
+    if not np.isfinite(grid.values).any():
+        text = f"{path} has no known cell among {grid.values.size}"
+        raise InputError("RIL-628", text, remedy="give another")
 
 
 def _without_marks(dem: DemFile) -> DemFile:
@@ -214,10 +218,9 @@ def read_ortho(path: Path) -> tuple[Grid, str]:
         grey, known = file.read(out_dtype="float32").mean(axis=0), file.dataset_mask() != 0
         t, crs = file.transform, file.crs
     wkt = _checked_system(path, t, crs)
-    known &= np.isfinite(grey)
-    if not known.any():
-        raise InputError("RIL-856", f"{path} has no known cell", remedy="give another image")
-    return _placed(np.where(known, grey, np.nan), t), wkt
+    grid = _placed(np.where(known, grey, np.nan), t)
+    _check_known(path, grid)
+    return grid, wkt
 
 
 def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

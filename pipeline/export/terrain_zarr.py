@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.rasters import above, tiles_of, whole
+from rille.pipeline.export.rasters import plane_tag, tiles_of, whole
 from rille.pipeline.export.view import RunView
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
 from rille.stages.core.declare import Array
@@ -110,7 +110,7 @@ def _write_output(path: Path, run: RunView) -> None:
     about = {
         "title": f"Merged terrain of the sequence {run.sequence.name}",
         "source": "stereo images: disparity by HFVM, elevation models by Locus, merged; Rille",
-        **above(run),
+        **plane_tag(run),
     }
     write_terrain(path, arrays, lattice, run.sequence.georeference, about)
 

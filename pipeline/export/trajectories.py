@@ -7,7 +7,7 @@ from typing import Any
 
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, there
+from rille.pipeline.export.view import RunView, artifact
 from rille.pipeline.export.writers import FRAME, WORLDS, write_table, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.declare import Bundle
 from rille.stages.odometry.resection.trajectory import world_poses
@@ -25,7 +25,7 @@ def _world(trajectory: Bundle, piece: int) -> str:
 
 
 def _trajectory(run: RunView) -> Bundle:
-    return there(run, run.products.trajectory)
+    return artifact(run, run.products.trajectory)
 
 
 def _write_kitti(path: Path, run: RunView) -> None:
@@ -46,7 +46,7 @@ def _write_pieces(path: Path, run: RunView) -> None:
 
 
 def _compared(run: RunView) -> CrosscheckComparison:
-    return compare(run, there(run, run.products.agreement))
+    return compare(run, artifact(run, run.products.agreement))
 
 
 def _write_crosscheck(path: Path, run: RunView) -> None:

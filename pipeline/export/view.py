@@ -101,7 +101,7 @@ def names(reads: Reads) -> list[str]:
     return [str(name) for name in reads(cast(RunView, _Name()))]
 
 
-def there(run: RunView, handle: Any) -> Bundle:
+def artifact(run: RunView, handle: Any) -> Bundle:
     """The artifact of a handle that has one."""
     bundle = run.bundle(handle)
     assert bundle is not None

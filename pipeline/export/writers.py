@@ -35,13 +35,13 @@ UNLEVELLED = (
     "right-handed, metres: that of the first left camera, whose own up is z since nothing tells of the vertical; "
     "origin at its centre, y its optical axis, x right"
 )
-"""The same where the vertical is not known."""
+"""The world frame in words where the vertical is not known."""
 
 ON_PLANE = (
     "right-handed, metres: z is the distance from a reference plane that is no ground, towards the cameras; origin at "
     "the point of the plane that is nearest to the first left camera, x right in its image, y up"
 )
-"""The same where elevations are distances from another plane than the ground."""
+"""The world frame in words where elevations are distances from another plane than the ground."""
 
 WORLDS = {NO_VERTICAL: UNLEVELLED, REFERENCE_PLANE: ON_PLANE}
 """The world frame in words by the source of its vertical, where it is not :data:`FRAME`."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import tomli_w
 from pydantic import Field, create_model
@@ -34,11 +34,21 @@ ACCURATE_TERRAIN: dict[str, Any] = {
 So many points because models that are half as wrong show half as small an error of the poses that merge them.
 """
 
-AND_THEN: tuple[tuple[str, str, Any, dict[str, Any]], ...] = (
-    ("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
-    ("locus", "both", True, {"locus": {"max_jump": 5.0}}),
+
+class Follows(NamedTuple):
+    """Values that suit another one: where ``section.key`` is ``value``, ``sets`` lies beneath what the user gives."""
+
+    section: str
+    key: str
+    value: Any
+    sets: dict[str, Any]
+
+
+ACCURATE_FOLLOWS = (
+    Follows("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
+    Follows("locus", "both", True, {"locus": {"max_jump": 5.0}}),
 )
-"""The same, where this value of that section's key has not been overruled.
+"""What follows of that preset where the user has overruled none of these values.
 
 With an accurate matcher the mean of what the disparity says and of what the images show is better than either. With
 both directions a cell's own standard deviation tells good from bad, so it is left more to choose from: disparities may
@@ -181,6 +191,20 @@ def merge(into: dict[str, Any], layer: Mapping[str, Any], within: str = "") -> d
     return into
 
 
+def refuse_other_sections(given: Iterable[str], own: Sequence[str], command: str) -> None:
+    """Refuse sections that a command does not read.
+
+    Raises
+    ------
+    ConfigError
+        One of those ``given`` is none of its ``own``.
+    """
+    for section in given:
+        if section not in own:
+            text = f"--set {section}: {command} reads {', '.join(own)} alone"
+            raise ConfigError("RIL-046", text, remedy=f"write --set {own[0]}.key=value")
+
+
 def split_dataset(layers: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Part the sections of sequences from those of stages: ``(dataset sections, stage sections)``."""
     ours = {k: v for k, v in layers.items() if k in DATASET_SECTIONS}
@@ -200,10 +224,10 @@ def build(*layers: Mapping[str, Any]) -> Params:
         merge(nested, layer)
     if _preset(nested, "terrain") == "accurate":
         nested = _beneath(nested, ACCURATE_TERRAIN)
-        for section, key, value, more in AND_THEN:
-            given = nested[section]
-            if isinstance(given, Mapping) and given[key] == value:
-                nested = _beneath(nested, more)
+        for one in ACCURATE_FOLLOWS:
+            given = nested[one.section]
+            if isinstance(given, Mapping) and given[one.key] == one.value:
+                nested = _beneath(nested, one.sets)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
     return validate(model(), nested, also=DATASET_SECTIONS)

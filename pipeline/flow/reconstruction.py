@@ -58,6 +58,7 @@ from typing import Any
 
 import numpy as np
 
+from rille.datasets.protocol import CAMERAS
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
@@ -322,12 +323,10 @@ def simultaneous(
             asked = make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain)
             p.contradictions.append(asked)
             timed = yield from done(asked)
-            wrong = [pair for pair, _ in timed.meta["partners"]]
-            if 2 * len(suspects) > len(basic) and (
-                "contradiction" in timed.meta or any("contradiction" in one.meta for one in judged)
-            ):
+            contradicted = any("contradiction" in one.meta for one in (timed, *judged))
+            if contradicted and 2 * len(suspects) > len(basic):
                 return None, {}
-            if wrong:
+            if wrong := [pair for pair, _ in timed.meta["partners"]]:
                 unfit += wrong
                 continue
         if not any("knocked" in one.meta for one in judged):
@@ -448,19 +447,19 @@ def moving_parts(
 ) -> dict[int, Handle[MovingFacts]]:
     """What moves by itself in each basic pair, by the next frame; in the last one by the frame before."""
     out = dict[int, Handle[MovingFacts]]()
-    for segment in segments:
-        for places, back in ((segment.frames[:2], False), (segment.frames[-2:], True)):
-            key = pairs.get(places[-1] if back else places[0])
-            if len(places) == 2 and key is not None and (not back or places[-1] == segments[-1].frames[-1]):
-                out[key.frame] = make.node(
-                    moving_stage,
-                    f"moving/{key.frame}",
-                    disparity=key.disparity,
-                    rig=key.rig,
-                    motion=make.motion(*places),
-                    segment=segment.resection,
-                    back=back,
-                )
+    steps = [(s, s.frames[:2], False) for s in segments] + [(s, s.frames[-2:], True) for s in segments[-1:]]
+    for segment, step, back in steps:
+        key = pairs.get(step[-1 if back else 0])
+        if len(step) == 2 and key is not None:
+            out[key.frame] = make.node(
+                moving_stage,
+                f"moving/{key.frame}",
+                disparity=key.disparity,
+                rig=key.rig,
+                motion=make.motion(*step),
+                segment=segment.resection,
+                back=back,
+            )
     return out
 
 
@@ -487,30 +486,33 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
         features = [make.features(frame, "left") for frame in here]
         blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
     laid: list[Ref[PlacesFacts]] = yield list(blocks)
-    compared = []
-    for block in laid:
-        for frame, earlier in zip(block.meta["pairs"], block.meta["candidates"], strict=True):
-            alike = [of[k] for k in (frame, *earlier)]
-            if not earlier:
-                continue
-            compared.append(
-                make.node(
-                    loop_stage,
-                    f"loop/{frame}",
-                    features=[make.features(pair.frame, "left") for pair in alike],
-                    disparities=[pair.disparity for pair in alike],
-                    rigs=[pair.rig for pair in alike],
-                    pairs=[frame, *earlier],
-                )
-            )
+    compared = [
+        loop(make, [of[k] for k in (frame, *earlier)])
+        for block in laid
+        for frame, earlier in zip(block.meta["pairs"], block.meta["candidates"], strict=True)
+        if earlier
+    ]
     seen = yield Maybe(compared)
     known = [one for one, ref in zip(compared, seen, strict=True) if ref is not None]
     return known if any(ref is not None and ref.meta["factors"] for ref in seen) else []
 
 
+def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
+    """Motions to the first of some pairs from each of the others, which look alike."""
+    frames = [pair.frame for pair in pairs]
+    return make.node(
+        loop_stage,
+        f"loop/{frames[0]}",
+        features=[make.features(frame, "left") for frame in frames],
+        disparities=[pair.disparity for pair in pairs],
+        rigs=[pair.rig for pair in pairs],
+        pairs=frames,
+    )
+
+
 def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
-    features = {(f, camera): make.features(f, camera) for f in whole for camera in ("left", "right")}
+    features = {(f, camera): make.features(f, camera) for f in whole for camera in CAMERAS}
     parts = [
         make.node(
             crosscheck_stage,

@@ -16,7 +16,7 @@ from rille.stages.hfvm.join_stage import hfvm_join_stage
 from rille.stages.hfvm.matcher import How, Tell, silent
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.tile_stage import hfvm_tile_stage
-from rille.stages.imaging.pyramid import PyramidParams
+from rille.stages.imaging.pyramid import PyramidParams, levels_of
 
 WHOLE_BYTES, TILE_BYTES = 170, 300
 """Room for matching a pixel, bytes: of images that are matched whole, and of a tile, whose surroundings it includes.
@@ -54,7 +54,7 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
     if not matcher.local(params) or tiling.tile == 0:
         return None
     # Tiles start from the maps of level 1, which the decisions on brightness and alignment precede.
-    if min(_levels(pyramid, shape) - _half(params) for shape in shapes) <= coarse.COARSE_LEVEL:
+    if min(levels_of(shape, pyramid) - _half(params) for shape in shapes) <= coarse.COARSE_LEVEL:
         return None
     chosen = tiling.tile
     if chosen is None:
@@ -73,14 +73,6 @@ def how(
     # Both directions side by side, or as many tiles as fit.
     most = 2 if size is None else int(memory.free() / (tiling.memory * 1e6))
     return How(tell, size, max(1, min(cores(), most)))
-
-
-def _levels(pyramid: PyramidParams, shape: Shape) -> int:
-    """Levels of the pyramid of an image."""
-    levels, side = 1, min(shape)
-    while levels < pyramid.levels and side >= 2 * pyramid.min_side:
-        levels, side = levels + 1, (side + 1) // 2
-    return levels
 
 
 def _half(params: HfvmParams) -> int:

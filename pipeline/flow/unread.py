@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
+from operator import attrgetter
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph
@@ -64,7 +65,7 @@ def refuse(keys: Iterable[str], config: Params, nobody: Collection[str], who: st
         No task reads one of the keys.
     """
     if lost := [key for key in keys if key in nobody or key.partition(".")[0] in nobody]:
-        raise ConfigError("RIL-730", f"{values(lost, config)}: no task of {who} reads it", remedy="leave it out")
+        raise ConfigError("RIL-730", f"{_values(lost, config)}: no task of {who} reads it", remedy="leave it out")
 
 
 def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
@@ -77,17 +78,14 @@ def unread(keys: Iterable[str], config: Params, graph: Graph) -> list[str]:
     return [key for key in keys if key.partition(".")[0] not in read]
 
 
-def values(keys: Iterable[str], config: Params) -> str:
-    """``track.points = 300, merge.alike = 0.5``."""
-    words = []
-    for key in keys:
-        section, _, name = key.partition(".")
-        words.append(f"{key} = {getattr(getattr(config, section), name)}")
-    return ", ".join(words)
-
-
-def remedy(keys: Iterable[str], config: Params) -> str:
-    """Return the remedy for parameters that no task read."""
-    sections = dict.fromkeys(key.partition(".")[0] for key in keys)
+def error(lost: Iterable[str], config: Params) -> ConfigError:
+    """The error of parameters that no task of a run reads."""
+    sections = [key.partition(".")[0] for key in lost]
     off = [s for s in sections if not getattr(getattr(config, s), "enabled", True)]
-    return f"set {off[0]}.enabled=true, or leave it out" if off else "leave it out, or choose frames that need it"
+    remedy = f"set {off[0]}.enabled=true, or leave it out" if off else "leave it out, or choose frames that need it"
+    return ConfigError("RIL-732", f"{_values(lost, config)}: no task of this run reads it", remedy=remedy)
+
+
+def _values(keys: Iterable[str], config: Params) -> str:
+    """``track.points = 300, merge.alike = 0.5``."""
+    return ", ".join(f"{key} = {attrgetter(key)(config)}" for key in keys)

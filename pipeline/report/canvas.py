@@ -23,7 +23,7 @@ from rille.pipeline.export.rasters import CLASSES
 
 WIDTH_INCHES = 4.6
 PIXELS_PER_INCH = 200
-"""Of rasters: twice what a panel takes on the screen."""
+"""Resolution of rasters: twice what a panel takes on the screen."""
 CSS_PIXELS_PER_INCH = 96
 
 RISK = SAFE, CAUTION, HAZARDOUS, UNKNOWN = tuple(CLASSES.values())
@@ -143,11 +143,11 @@ def compressed(picture: Any, kind: str, **options: Any) -> str:
 
 
 @cache
-def ramp(name: str) -> NDArray[np.uint8]:
-    """The 256 colours (256, 3) of a colour map of matplotlib."""
+def ramp() -> NDArray[np.uint8]:
+    """The 256 colours (256, 3) of values from low to high."""
     import matplotlib
 
-    return np.asarray(np.rint(255 * matplotlib.colormaps[name](np.arange(256))[:, :3]), dtype=np.uint8)
+    return np.asarray(np.rint(255 * matplotlib.colormaps["viridis"](np.arange(256))[:, :3]), dtype=np.uint8)
 
 
 def paint(classes: NDArray[np.uint8], *colors: str) -> NDArray[np.uint8]:

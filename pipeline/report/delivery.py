@@ -91,7 +91,7 @@ def has_truth(view: RunView) -> list[bool]:
     return [truth is not None and truth[frame] is not None for frame in view.frames]
 
 
-def which(frames: list[int]) -> str:
+def frame_words(frames: list[int]) -> str:
     """``frames 1-3, 7``."""
     return f"frame{'s' if len(frames) > 1 else ''} {spans(frames)}"
 
@@ -147,20 +147,21 @@ def _failures(view: RunView) -> Items:
             # The figures in a message are those of one pair: the cause is the words.
             kind = _kind(root.label) if root.status == "failed" else ""
             causes.setdefault((kind, re.sub(r"-?[0-9][0-9.]*", "#", root.reason)), []).append(t)
-    items = []
-    for (kind, _), behind in causes.items():
-        failed = [t for t in behind if t.status == "failed"]
-        if not kind:
-            why = behind[0].reason or "something it depends on is missing"
-            items.append(_item("skipped", some([t.label for t in behind], 6), why))
-            continue
-        n, waiting = len(failed), len(behind) - len(failed)
-        whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
-        what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
-        if waiting:
-            what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
-        items.append(_item("failed", what, failed[0].reason))
-    return items
+    return [_failure(view, kind, behind) for (kind, _), behind in causes.items()]
+
+
+def _failure(view: RunView, kind: str, behind: list[TaskRow]) -> dict[str, str]:
+    """What one cause has cost: failed tasks of a ``kind`` (empty: none failed) and those that depend on them."""
+    if not kind:
+        why = behind[0].reason or "something it depends on is missing"
+        return _item("skipped", some([t.label for t in behind], 6), why)
+    failed = [t for t in behind if t.status == "failed"]
+    n, waiting = len(failed), len(behind) - len(failed)
+    whole, names = sum(_kind(t.label) == kind for t in view.tasks), [t.label[len(kind) + 1 :] for t in failed]
+    what = f"{n} of {whole} tasks {kind} failed ({some(names, 12)})" if whole > 1 else f"{failed[0].label} failed"
+    if waiting:
+        what += f": {count(waiting, 'task')} depend{'s' * (waiting == 1)} on {'it' if n == 1 else 'them'}"
+    return _item("failed", what, failed[0].reason)
 
 
 def _kind(label: str) -> str:
@@ -172,11 +173,11 @@ def _poses(frames: Rows) -> Items:
     items = []
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
-        items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", which(lost)))
+        items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", frame_words(lost)))
     apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
     if apart:
         what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
-        items.append(_item("piece", what, which(apart)))
+        items.append(_item("piece", what, frame_words(apart)))
     return items
 
 
@@ -185,7 +186,7 @@ def _local_paths(pairs: Rows) -> Items:
     reached, asked = local_paths(pairs)
     without = [r for r in pairs if r["path"] not in (None, "found")]
     at = {reason: [r["frame"] for r in without if r["path"] == reason] for reason in [r["path"] for r in without]}
-    why = "; ".join(f"{reason} ({which(frames)})" for reason, frames in at.items())
+    why = "; ".join(f"{reason} ({frame_words(frames)})" for reason, frames in at.items())
     return [_item("no local path", f"No local path from {asked - reached} of {asked} stops", why)] if why else []
 
 
@@ -195,7 +196,7 @@ def on_plane(view: RunView) -> bool:
 
 
 def _reference(view: RunView) -> Items:
-    """That nothing was asked of a vehicle, and why."""
+    """State that neither hazards nor paths were asked for, and why."""
     if not on_plane(view):
         return []
     first = facts_of(view, next(iter(view.products.level.values())))
@@ -263,7 +264,7 @@ def _truth(view: RunView) -> Items:
         return []
     if any(known):
         gaps = [frame for frame, there in zip(view.frames, known, strict=True) if not there]
-        return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", which(gaps))]
+        return [_item("no truth", f"{len(gaps)} of {len(known)} frames have no truth", frame_words(gaps))]
     none = view.sequence.truth is None and view.sequence.truth_positions is None
     owner = "the sequence has none" if none else "it has none for the chosen frames"
     if view.products.disparity_accuracy:
@@ -272,7 +273,7 @@ def _truth(view: RunView) -> Items:
 
 
 def _vehicle(view: RunView) -> Items:
-    """That the limits are the defaults, of which each run knows for itself whether somebody stated them."""
+    """State that the vehicle's limits are the defaults; :func:`complete` keeps this where nobody has stated them."""
     v = view.config.vehicle
     if view.bundle(view.products.world_risk) is None:
         return []
@@ -300,7 +301,7 @@ def _crosscheck_lost(scene: Scene) -> Items:
     if not lost:
         return []
     meta = facts_of(view, view.products.crosscheck)
-    reasons = [f"COLMAP has no pose of {which(lost)}"]
+    reasons = [f"COLMAP has no pose of {frame_words(lost)}"]
     if len(meta.get("pieces") or ()) > 1:
         reasons.append(f"its trajectory falls into {len(meta['pieces'])} pieces, each laid on ours by itself")
     reasons += meta.get("reasons") or ()

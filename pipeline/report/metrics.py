@@ -67,13 +67,13 @@ def metrics(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Metric]:
         ("Rig", _rig(scene)),
         ("Matching and terrain", _matching(pairs) | _terrain(scene)),
         ("Hazards and path", _hazards(scene, pairs) | _path(scene)),
-        ("Run", {"baseline": stated("Stereo baseline", view.sequence.rig.baseline, "m", "given; sets the scale")}),
+        ("Run", {"baseline": metric("Stereo baseline", view.sequence.rig.baseline, "m", "given; sets the scale")}),
     ):
         by_name |= {name: {**entry, "group": group, "truth": None} for name, entry in more.items()}
     return by_name
 
 
-def stated(label: str, value: Any, unit: str, how: str, completeness: str | None = None) -> Metric:
+def metric(label: str, value: Any, unit: str, how: str, completeness: str | None = None) -> Metric:
     """A figure of a run; its group and the truth are added by what lists it."""
     plain = value if isinstance(value, str | int) or value is None else tables.finite(value)
     return {"label": label, "value": plain, "unit": unit, "how": how, "completeness": completeness}
@@ -119,7 +119,7 @@ def _disparity(view: RunView) -> dict[str, Metric]:
         values = [figures[name]["value"] for figures in judged if figures[name]["value"] is not None]
         label, how = _label(name), f"{judged[0][name]['how'].partition('; ')[0]}: mean over pairs"
         every = f"{len(values)} of {len(pairs)} pairs"
-        entry = stated(label, statistics.fmean(values) if values else None, judged[0][name]["unit"], how, every)
+        entry = metric(label, statistics.fmean(values) if values else None, judged[0][name]["unit"], how, every)
         by_name[f"disparity_{name}"] = {"group": "Disparity against truth", "truth": "true disparities", **entry}
     return by_name
 
@@ -153,10 +153,10 @@ def _local_elevation(view: RunView, pairs: Rows) -> dict[str, Metric]:
         how = f"RMS of local elevation minus exact elevation {where}"
         median, worst = (statistics.median(errors), max(errors)) if errors else (None, None)
         label = "Elevation error of a pair, RMS"
-        by_name["dem_pairs_rmse_median"] = stated(f"{label}, median", median, "m", f"{how}, median over pairs", every)
-        by_name["dem_pairs_rmse_max"] = stated(f"{label}, worst", worst, "m", f"{how}, worst pair", every)
+        by_name["dem_pairs_rmse_median"] = metric(f"{label}, median", median, "m", f"{how}, median over pairs", every)
+        by_name["dem_pairs_rmse_max"] = metric(f"{label}, worst", worst, "m", f"{how}, worst pair", every)
         how = f"share of the cells that both cameras see which have an elevation, {where}"
-        by_name["dem_pairs_completeness_min"] = stated("Completeness of a pair, worst", min(shares), "1", how, every)
+        by_name["dem_pairs_completeness_min"] = metric("Completeness of a pair, worst", min(shares), "1", how, every)
     return by_name
 
 
@@ -169,19 +169,19 @@ def _poses(frames: Rows) -> dict[str, Metric]:
     posed = [r for r in frames if r["posed"]]
     resected = [r for r in posed if r["rms_px"]]
     every = f"{len(posed)} of {len(frames)} frames"
-    by_name = {"frames_posed": stated("Frames with a pose", len(posed), "frames", "counted", every)}
+    by_name = {"frames_posed": metric("Frames with a pose", len(posed), "frames", "counted", every)}
     pieces = len({r["piece"] for r in posed})
     if pieces > 1:
         how = f"in the largest of {pieces} pieces, whose frame is the world; the others have frames of their own"
         value = sum(r["in_world"] for r in posed)
-        by_name["frames_in_world"] = stated("Frames with a pose in the world", value, "frames", how, every)
+        by_name["frames_in_world"] = metric("Frames with a pose in the world", value, "frames", how, every)
     if resected:
         how = "root mean square over the landmarks that agree with the pose, then median over frames"
         value = statistics.median(r["rms_px"] for r in resected)
-        by_name["reprojection_rms"] = stated("Back-projection error", value, "px", how, every)
+        by_name["reprojection_rms"] = metric("Back-projection error", value, "px", how, every)
         how = "landmarks left after removal of inconsistent ones: median over frames"
         value = statistics.median(r["inliers"] for r in resected)
-        by_name["inliers"] = stated("Landmarks a frame", value, "", how, every)
+        by_name["inliers"] = metric("Landmarks a frame", value, "", how, every)
     return by_name
 
 
@@ -194,7 +194,7 @@ def _agreement(scene: Scene) -> dict[str, Metric]:
     given = _assessed(scene.view, scene.view.products.agreement, "agreement_", "", None, AGREEMENT)
     by_name = {name: {**entry, "completeness": every} for name, entry in given.items()}
     how = str(compared.meta.get("rule") or "by their disagreement")
-    by_name["agreement_flagged"] = stated("Frames flagged", int(compared.flagged.sum()), "frames", how, every)
+    by_name["agreement_flagged"] = metric("Frames flagged", int(compared.flagged.sum()), "frames", how, every)
     return by_name
 
 
@@ -206,7 +206,7 @@ def _rig(scene: Scene) -> dict[str, Metric]:
     every = f"{len(scene.view.products.orientations)} basic pairs, {len(calibration.before)} matches"
     by_name, how = {}, "RMS distance of matched points from their epipolar lines, outliers left out"
     for name, rig, when in (("rig_residual_given", "given rig", "before"), ("rig_residual", "used rig", "after")):
-        by_name[name] = stated(f"Epipolar residual, {rig}", calibration.residual(when), "px", how, every)
+        by_name[name] = metric(f"Epipolar residual, {rig}", calibration.residual(when), "px", how, every)
     return by_name
 
 
@@ -219,14 +219,14 @@ def _matching(pairs: Rows) -> dict[str, Metric]:
             "(not interpolated): mean over pairs"
         )
         every = f"{len(matched)} of {len(pairs)} basic pairs"
-        by_name["matched"] = stated("Matched pixels", statistics.fmean(matched), "1", how, every)
+        by_name["matched"] = metric("Matched pixels", statistics.fmean(matched), "1", how, every)
     offsets = _values(pairs, "difference_m")
     if offsets:
         how = (
             "elevation of a model minus that of the one before, bias of their common cells: its size, median over pairs"
         )
         every, value = f"{len(offsets)} of {len(pairs) - 1} successive models", statistics.median(map(abs, offsets))
-        by_name["overlap_median"] = stated("Offset of overlapping models", value, "m", how, every)
+        by_name["overlap_median"] = metric("Offset of overlapping models", value, "m", how, every)
     return by_name
 
 
@@ -237,13 +237,13 @@ def _terrain(scene: Scene) -> dict[str, Metric]:
     there, cell = np.isfinite(world.arrays["elevation"]), world.lattice.cell
     of_map = f"{there.mean():.0%} of the map's cells"
     by_name = {
-        "cell_size": stated("Cell size", cell, "m", "from the rig, or given (locus.cell_size)"),
-        "mapped_area": stated("Mapped area", float(there.sum()) * cell**2, "m²", "cells with an elevation", of_map),
+        "cell_size": metric("Cell size", cell, "m", "from the rig, or given (locus.cell_size)"),
+        "mapped_area": metric("Mapped area", float(there.sum()) * cell**2, "m²", "cells with an elevation", of_map),
     }
     sigma = world.arrays.get("elevation_std")
     if sigma is not None and np.isfinite(sigma).any():
         value = float(np.nanmedian(sigma))
-        by_name["elevation_sigma"] = stated("Predicted σ of elevation, median", value, "m", SIGMA + "cells", of_map)
+        by_name["elevation_sigma"] = metric("Predicted σ of elevation, median", value, "m", SIGMA + "cells", of_map)
     return by_name
 
 
@@ -254,12 +254,12 @@ def _hazards(scene: Scene, pairs: Rows) -> dict[str, Metric]:
         how = f"share of all cells of the risk map; limits of {scene.view.config.vehicle.name}"
         for k, name in enumerate(("safe", "caution", "hazardous", "unknown")):
             share = float((scene.risk.arrays["risk"] == k).mean())
-            by_name[name] = stated(f"{name.capitalize()} cells", share, "1", how)
+            by_name[name] = metric(f"{name.capitalize()} cells", share, "1", how)
     reached, asked = delivery.local_paths(pairs)
     if asked:
         how = "counted; a path leads at least the vehicle's length ahead, as far as the ground is known and safe"
         every = f"{asked} of {len(pairs)} basic pairs"
-        by_name["local_paths"] = stated("Local paths found", reached, "", how, every)
+        by_name["local_paths"] = metric("Local paths found", reached, "", how, every)
     return by_name
 
 
@@ -271,16 +271,16 @@ def _path(scene: Scene) -> dict[str, Metric]:
     how = "in plan; nearer ground is not seen, or not to be driven on"
     away = delivery.start_of_path(view)
     by_name = {
-        "path_length": stated("Path length", facts.get("length_m"), "m", "along its vertices in 3-D"),
-        "path_start": stated("Start of the path from the first camera", away, "m", how),
+        "path_length": metric("Path length", facts.get("length_m"), "m", "along its vertices in 3-D"),
+        "path_start": metric("Start of the path from the first camera", away, "m", how),
     }
     for name, fact, label, unit, how in ON_PATH:
         value = facts.get(fact)
         if value is not None:
-            by_name[name] = stated(label, float(np.degrees(value)) if unit == "deg" else value, unit, how)
+            by_name[name] = metric(label, float(np.degrees(value)) if unit == "deg" else value, unit, how)
     sigma = np.zeros(0) if scene.world is None else scene.world.at("elevation_std", points[:, :2])
     known = sigma[np.isfinite(sigma)]
     if known.size:
         every, label = f"{known.size} of {len(points)} vertices", "Predicted σ of elevation along the path"
-        by_name["path_sigma"] = stated(label, float(np.median(known)), "m", SIGMA + "the path's vertices", every)
+        by_name["path_sigma"] = metric(label, float(np.median(known)), "m", SIGMA + "the path's vertices", every)
     return by_name

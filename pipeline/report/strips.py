@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 
 BUDGET_CHARACTERS = 900_000
-"""Of the pictures of a strip: the page has 5 MB at most."""
+"""All pictures of a strip together: the page has 5 MB at most."""
 PLANNED_SHARE = 0.75
-"""Of the budget: one column is not like the others."""
+"""Part of the budget that columns like the middle one take: others may need more."""
 MAX_WIDTH_PIXELS, MIN_WIDTH_PIXELS = 400, 140
-"""Of a column; 400 are twice what it takes on the screen."""
+"""Widths of a column; 400 pixels are twice what it takes on the screen."""
 MAX_HEIGHT_OVER_WIDTH = 1.2
-"""Of one picture of a column."""
+"""Bound of the shape of one picture of a column."""
 LEGEND = tuple(zip(canvas.RISK, canvas.CLASS_NAMES, strict=True))
 
 
@@ -198,7 +198,7 @@ def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Im
 
 
 def _colors(share: Floats) -> NDArray[np.uint8]:
-    return np.asarray(canvas.ramp("viridis")[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
+    return np.asarray(canvas.ramp()[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
 
 
 def _with_lines(picture: Image, ground: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:

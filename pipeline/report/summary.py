@@ -18,7 +18,7 @@ from rille.pipeline.flow.products import Products
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
-from rille.pipeline.report.metrics import metrics, stated
+from rille.pipeline.report.metrics import metric, metrics
 from rille.pipeline.report.words import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.intrinsics import CORRECTED
@@ -67,7 +67,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     complete = delivery.is_complete(outcome["missing"]) and not view.part
     state = "Incomplete" if not complete else "Complete but for what is listed" if outcome["missing"] else "Complete"
     how = "wall clock, without writing the page; what is cached costs no time"
-    clock = {"group": "Run", "truth": None, **stated("Time of this run's tasks", view.seconds, "s", how)}
+    clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {
         "format": REPORT_FORMAT,
         "run": view.run_id,
@@ -103,7 +103,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     if compared is not None and compared.flagged.any():
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
-        lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.which(bad)}")
+        lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.frame_words(bad)}")
     lines += _unlike(figures)
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
@@ -172,7 +172,7 @@ def _displaced(view: RunView) -> list[str]:
 
 def _imu(view: RunView) -> list[str]:
     """The IMU contradicts the images by its rotations, or it or a stated vertical the ground that they show."""
-    # Of the ground that was looked for: elevations may be measured from another plane.
+    # The ground also where elevations are measured from another plane.
     s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
     axes, lines = None if s.imu_axes is None else np.array(s.imu_axes), []
     if axes is not None and s.attitude is not None and trajectory is not None and s.times is not None:

@@ -51,7 +51,7 @@ def frames(scene: gather.Scene) -> list[Row]:
 
 
 def loops(scene: gather.Scene) -> dict[str, list[Row]]:
-    """One row a place seen again, and one a pair of frames that look alike and are no such place; none without any."""
+    """Rows of places that were seen again, and of frames that look alike but were refused; none without loops."""
     p, bundle = scene.view.products, scene.view.bundle
     chained, adjusted, seen = bundle(p.chained), bundle(p.trajectory), [bundle(handle) for handle in p.loops]
     if chained is None or adjusted is None:

@@ -56,7 +56,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
     step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MAX_CELLS)))
     z = world.arrays["elevation"][::step, ::step]
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
-    # Of two bytes; 0 is undefined.
+    # Two bytes a height; 0 is undefined.
     height = _steps(z, low, max(high - low, 1e-9), 65534)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
     risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
@@ -83,7 +83,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "judged": scene.risk is not None,
         "reasons": {name: int(bit) for name, bit in REASONS.items()},
         "colors": list(canvas.RISK),
-        "ramp": base64.b64encode(canvas.ramp("viridis").tobytes()).decode("ascii"),
+        "ramp": base64.b64encode(canvas.ramp().tobytes()).decode("ascii"),
         "track": _track(scene),
         "frusta": _frusta(scene),
         "path": _path(scene),

@@ -63,7 +63,7 @@ def spread(values: Any) -> str:
 
 def spans(numbers: list[int]) -> str:
     """``[1, 2, 3, 7]`` to ``1-3, 7``."""
-    # Of successive numbers the place in the list less the number is the same.
+    # Along successive numbers, the number less its place in the list stays the same.
     groups = itertools.groupby(enumerate(numbers), key=lambda at: at[1] - at[0])
     runs = [[n for _, n in group] for _, group in groups]
     return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

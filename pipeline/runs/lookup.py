@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -109,6 +109,19 @@ def near(text: str, names: Iterable[str]) -> str:
     known = list(dict.fromkeys(names))
     alike = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or [n for n in known if text and text in n][:3]
     return f"did you mean {' or '.join(alike)}?" if alike else ""
+
+
+def refuse_unknown(option: str, given: Iterable[str], known: Collection[str], what: str) -> None:
+    """Refuse names that an option does not know.
+
+    Raises
+    ------
+    ConfigError
+        One of those ``given`` is none of the ``known``; the message has the nearest names, or all.
+    """
+    for name in sorted(set(given).difference(known)):
+        hint = near(name, known) or f"one of {', '.join(sorted(known))}"
+        raise ConfigError("RIL-035", f"{option} {name!r} is no {what}", remedy=hint)
 
 
 def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:

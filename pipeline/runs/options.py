@@ -63,7 +63,7 @@ class Settings:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Work(Settings):
-    """Those, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
+    """:class:`Settings`, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Work(Settings):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Options(Work):
-    """Those, and options of the folder of results and of the messages during a run.
+    """:class:`Work`, and options of the folder of results and of the messages during a run.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class DriveOptions(Options):
 @Parameter(name="*")
 @dataclass(frozen=True)
 class WatchOptions(Options):
-    """Those of a run, and when the watch ends.
+    """:class:`Options`, and when the watch ends.
 
     Parameters
     ----------
@@ -158,8 +158,8 @@ def cache_folder(given: str | Path | None) -> Path:
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
 
-def named(output: Path, ending: str) -> Path:
-    """One of the files of an output that is named without ending; a name with the ending of one is that of all.
+def output_file(output: Path, ending: str) -> Path:
+    """The file with this ending, of an output of several files: its name has no ending, or that of one of them.
 
     Raises
     ------

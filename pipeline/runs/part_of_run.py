@@ -8,6 +8,7 @@ from rille.pipeline.engine.graph import Cut
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.view import names
 from rille.pipeline.flow import config
+from rille.pipeline.runs.lookup import refuse_unknown
 from rille.stages.core.errors import ConfigError
 
 FLOWS = ("builders", "reconstruction", "assessment")
@@ -39,11 +40,9 @@ def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
     if until and only:
         raise ConfigError("RIL-034", "--until and --only are both given", remedy="give one of them")
     stages = set(config.stages(*FLOWS))
-    for name in sorted(set(until) - stages):
-        raise ConfigError("RIL-035", f"--until {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
+    refuse_unknown("--until", until, stages, "stage")
     files = {output.name: output for output in catalogue.OUTPUTS if output.write is not None}
-    for name in sorted(set(only) - set(files)):
-        raise ConfigError("RIL-036", f"--only {name!r} is no file", remedy=f"one of {', '.join(files)}")
+    refuse_unknown("--only", only, files, "file")
     wanted = {*until, "output"}
     if until:
         return Cut(frozenset(until), lambda h: h.stage in wanted or h.label.partition("/")[0] in wanted)

@@ -34,7 +34,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
 from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
-from rille.pipeline.runs.lookup import LEDGER
+from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -111,9 +111,8 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
 def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
     """As :func:`settings`, for a run: refuse what it cannot use; ``warn`` takes what is suspicious but possible."""
     # Before anything is read or written.
-    stages = configuration.stage_names() if options.force else set()
-    for name in sorted(options.force - stages):
-        raise ConfigError("RIL-060", f"--force {name!r} is no stage", remedy=f"one of {', '.join(sorted(stages))}")
+    if options.force:
+        refuse_unknown("--force", options.force, configuration.stage_names(), "stage")
     check(options.executor, options.jobs)
     memory_limit(options)
     settled = settings(sequence, options)
@@ -212,20 +211,20 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
     """What a run came to, in its closing lines; ``missing`` as its report lists it."""
     from rille.pipeline.report.delivery import is_complete, left_out
 
-    total, lines, arrived = result.total(), [], True
+    counts, lines, arrived = result.counts, [], True
     if opened.drive is not None:
         outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
         lines.append(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
         arrived = outcome[0] == "goal"
     page = opened.folder / "report.html"
-    lines.append(f"{page}  computed {total.computed}, cached {total.cached}, missing {len(missing)}")
+    lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(missing)}")
     if opened.view.part:
         lines.append(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
     words = (": ".join(word for word in (item["what"], item["why"]) if word) for item in missing)
     complaints = [f"rille: missing: {line}" for line in words]
     if not result.ok:
         ledger = opened.folder / LEDGER
-        complaints.append(f"rille: {total.failed} failed, {total.skipped} left out; ledger: {ledger}")
+        complaints.append(f"rille: {counts['failed']} failed, {counts['skipped']} left out; ledger: {ledger}")
     done = result.ok and arrived
     # A drive that ended early did not come to the tasks that would have read all parameters.
     idle = list(_idle(opened)) if done else []
@@ -315,10 +314,9 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
 def _idle(opened: _Opened) -> Iterator[str]:
     """Errors of a run that came to its end: a parameter that no task of it read, and stages that it does not have."""
     # What a part of a run does not read may be meant for the rest.
-    lost = [] if opened.view.part else unread.unread(opened.settled.given, opened.view.config, opened.graph)
-    if lost:
-        text = f"{unread.values(lost, opened.view.config)}: no task of this run read it"
-        yield f"rille: error RIL-732: {text}: {unread.remedy(lost, opened.view.config)}"
+    if not opened.view.part and (lost := unread.unread(opened.settled.given, opened.view.config, opened.graph)):
+        error = unread.error(lost, opened.view.config)
+        yield f"rille: error {error.code}: {error}"
     idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})
     if idle:
         yield f"rille: error RIL-735: --force {', '.join(idle)}: this run has no such task: leave it out"

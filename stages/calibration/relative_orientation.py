@@ -34,7 +34,6 @@ TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i))
 """Degrees of the column and the row of the smooth error's polynomials."""
 
 SIZE = RIG + PRINCIPAL + len(TERMS)
-SMOOTH = slice(RIG + PRINCIPAL, SIZE)
 
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""

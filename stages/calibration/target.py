@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
@@ -46,7 +46,6 @@ FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
 MAX_STEPS, SETTLED = 100, 1e-10
 """Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
-UNDETERMINED = "the views do not determine the cameras"
 MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
 )
@@ -115,15 +114,11 @@ def calibrate_rig(
 
     Raises
     ------
-    ConfigError
-        The model is unknown.
     DegenerateError
         There are too few views, or they do not determine the cameras.
     InputError
         The right camera stands on the left one's left.
     """
-    if model not in MODELS:
-        raise ConfigError("RIL-308", f"distortion model {model!r} is unknown", remedy=f"one of {', '.join(MODELS)}")
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
     # A bounded loss sees no way from far off, and a fisheye's start is some pixels off.
@@ -158,6 +153,11 @@ def _enough(views: Sequence[BoardView]) -> None:
             f"{len(views)} views of the board are too few to calibrate with",
             remedy=MORE_VIEWS,
         )
+
+
+def _undetermined() -> DegenerateError:
+    remedy = f"{MORE_VIEWS}, or a model with fewer coefficients"
+    return DegenerateError("RIL-311", "the views do not determine the cameras", remedy=remedy)
 
 
 def _sides(T_right_left: RigidTransform) -> None:
@@ -219,9 +219,7 @@ class Adjustment:
             flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
             out = cv2.calibrateCamera(boards, flat, size, None, None, flags=flags)
         except cv2.error as error:
-            raise DegenerateError(
-                "RIL-311", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients"
-            ) from error
+            raise _undetermined() from error
         finally:
             cv2.setNumThreads(threads)
         _, k, d, rotations, translations = out
@@ -344,7 +342,7 @@ class Adjustment:
         scaled = jacobian / np.where(scale > 0, scale, 1.0)
         normal = scaled.T @ scaled
         if not scale.all() or np.linalg.cond(normal) > 1e15:
-            raise DegenerateError("RIL-313", UNDETERMINED, remedy=f"{MORE_VIEWS}, or a model with fewer coefficients")
+            raise _undetermined()
         variance = float(residual @ residual) / (residual.size - x.size)
         covariance = variance * np.linalg.inv(normal) / np.outer(scale, scale)
         deviation = np.sqrt(np.diag(covariance))

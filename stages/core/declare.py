@@ -121,9 +121,9 @@ Size = Callable[[Any, Mapping[str, Any], Mapping[str, Any]], float]
 
 @dataclass(frozen=True)
 class Memory:
-    """Guess of the memory of a task, used until tasks of the stage have been measured.
+    """Guess of the memory of a task.
 
-    The guess is ``fixed`` bytes, and ``factor`` more for each byte of input (decoded arrays of all inputs, and what
+    It is ``fixed`` bytes, and ``factor`` more for each byte of input (decoded arrays of all inputs, and what
     ``size`` adds); ``result`` is the guess of decoded bytes of result a byte of input. ``lower`` names the parameters
     that reduce the memory, as the user writes them (``hfvm.preset``).
     """

@@ -7,11 +7,11 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, inline="always")
-def cubic(a, x, y, x0=0, y0=0):  # type: ignore[no-untyped-def]
-    """Catmull-Rom value (float32) at (x, y), a pixel or more inside, of an image that ``a`` shows from x0, y0."""
+def cubic(a, x, y):  # type: ignore[no-untyped-def]
+    """Catmull-Rom value (float32) of an image ``a`` at (x, y), a pixel or more inside."""
     whole_x, whole_y = np.int64(x), np.int64(y)
-    # Unsigned indices need no check for counting from the end. In float32 fractions must not depend on the window.
-    i, j, step = np.uint64(whole_x - x0), np.uint64(whole_y - y0), np.uint64(1)
+    # Unsigned indices need no check for counting from the end.
+    i, j, step = np.uint64(whole_x), np.uint64(whole_y), np.uint64(1)
     t, s = np.float32(x) - np.float32(whole_x), np.float32(y) - np.float32(whole_y)
     left, right, far = i - step, i + step, i + step + step
     above, below, bottom = j - step, j + step, j + step + step

@@ -125,6 +125,31 @@ def grey(image: AnyArray) -> Floats32:
     )
 
 
+def usable(image: Floats32, valid: AnyArray | None) -> Bools:
+    """Pixels (row, col) of a grey image that are finite and, where ``valid`` is given, not zero there.
+
+    Raises
+    ------
+    InputError
+        ``valid`` has another shape.
+    """
+    mask: Bools = np.isfinite(image)
+    if valid is not None:
+        if valid.shape != image.shape:
+            text = f"mask {valid.shape} and image {image.shape} differ"
+            raise InputError("RIL-413", text, remedy="give a mask of the image's size")
+        mask &= valid != 0
+    return mask
+
+
+def levels_of(shape: tuple[int, ...], params: PyramidParams) -> int:
+    """Levels of the pyramid of an image of a shape."""
+    levels, side = 1, min(shape)
+    while levels < params.levels and side >= 2 * params.min_side:
+        levels, side = levels + 1, (side + 1) // 2
+    return levels
+
+
 def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None) -> Pyramid:
     """Pyramid of one grey image.
 
@@ -139,25 +164,15 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         The image is not grey, or the mask has another shape.
     """
     level = grey(image)
-    if valid is not None and valid.shape != level.shape:
-        raise InputError(
-            "RIL-413", f"mask {valid.shape} and image {level.shape} differ", remedy="give a mask of the image's size"
-        )
-    # Of whole numbers no pixel need be asked whether it is finite.
-    whole = image.dtype.kind == "u"  # and so finite
-    mask = np.ones(level.shape, bool) if whole else np.isfinite(level)
-    if valid is not None:
-        mask &= valid != 0
+    mask = usable(level, valid)
     # What a mask leaves out is often black, too, and no frame.
     black = frame(level, mask)
     if black is not None:
         mask &= ~black
-    levels, side = 1, min(level.shape)
-    while levels < params.levels and side >= 2 * params.min_side:
-        levels, side = levels + 1, (side + 1) // 2
-    if not (whole and valid is None and black is None):
+    if not (image.dtype.kind == "u" and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    pyramid = halved(level, mask.view(np.uint8), levels, MIN_VALID if black is None else MIN_VALID_AT_FRAME)
+    least = MIN_VALID if black is None else MIN_VALID_AT_FRAME
+    pyramid = halved(level, mask.view(np.uint8), levels_of(level.shape, params), least)
     return Pyramid(pyramid.images, pyramid.valid, noise.standard_deviation(pyramid.images, pyramid.valid))
 
 

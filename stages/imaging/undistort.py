@@ -18,7 +18,7 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
-from rille.stages.imaging.pyramid import grey
+from rille.stages.imaging.pyramid import grey, usable
 
 PHASES_PER_PX = 4096
 """Positions between two pixels that weights are tabulated for; the nearest one is taken."""
@@ -72,17 +72,9 @@ def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | Non
             f"the image is {raw.shape[1]} x {raw.shape[0]} pixels, its lens is calibrated for {size[1]} x {size[0]}",
             remedy="give images as they were calibrated: not scaled, not cropped",
         )
-    if valid is not None and valid.shape != size:
-        raise InputError(
-            "RIL-455", f"mask {valid.shape} and image {raw.shape} differ", remedy="give a mask of the image's size"
-        )
-    # Floating-point images may hold NaN for what is not known.
-    usable = np.isfinite(raw)
-    if valid is not None:
-        usable &= valid != 0
     maps = lens.maps(camera)
     out, out_valid = np.zeros(maps[0].shape, np.float32), np.zeros(maps[0].shape, np.uint8)
-    _resample(raw, usable, maps, weights(), out, out_valid)
+    _resample(raw, usable(raw, valid), maps, weights(), out, out_valid)
     # Kernels with negative weights overshoot at edges.
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 

@@ -122,7 +122,7 @@ def test_damage_of_one_file(small, tmp_path, row, rounds):
                 # a run that reads nothing: what the look-up sees is computed again
                 graph, result = run(cache)
                 wrong += look.wrong(digests(graph), small["digests"])
-                recomputed += result.total().computed
+                recomputed += result.counts["computed"]
                 expected += seen
 
                 # a run in which all scales are computed again, and read
@@ -130,7 +130,7 @@ def test_damage_of_one_file(small, tmp_path, row, rounds):
                 graph, result = run(cache, force={"scale"})
                 assert result.ok, (kind, way, result.failures)
                 wrong += look.wrong(digests(graph), small["digests"])
-                recomputed += result.total().computed
+                recomputed += result.counts["computed"]
                 expected += SMALL + healed
 
                 # what nobody reads is found by comparing everything
@@ -140,7 +140,7 @@ def test_damage_of_one_file(small, tmp_path, row, rounds):
                 graph, result = run(cache)
                 wrong += look.wrong(digests(graph), small["digests"])
                 wrong += look.wrong(look.decoded(cache), small["digests"])
-                recomputed += result.total().computed
+                recomputed += result.counts["computed"]
                 expected += len(found)
                 lost += sorted(set(small["digests"]) - set(look.published(cache)))
                 shutil.rmtree(cache)
@@ -188,7 +188,7 @@ def test_disk_full_at_a_step(small, tmp_path, row, monkeypatch, code, every):
             assert not left, (faults.steps[step - 1], left)
             graph, result = run(cache)
             wrong += look.wrong(digests(graph), small["digests"])
-            recomputed += result.total().computed
+            recomputed += result.counts["computed"]
             expected += len(small["digests"]) - len(found)
             shutil.rmtree(cache, ignore_errors=True)
     every_one = "each step" if every == 1 else f"each {every}th step"
@@ -247,7 +247,7 @@ def test_read_only_cache(small, tmp_path, row, monkeypatch):
     assert "cannot be used (Read-only file system)" in str(failed.failures[0].error)
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
     wrong = look.wrong(digests(graph), small["digests"]) + look.wrong(digests(lacking), small["digests"])
-    row("read-only cache", 2, [], wrong, result.total().computed, 0, "what is missing is refused in one line")
+    row("read-only cache", 2, [], wrong, result.counts["computed"], 0, "what is missing is refused in one line")
 
 
 @pytest.mark.parametrize("seeds", [3, pytest.param(30, marks=pytest.mark.slow)])
@@ -257,7 +257,7 @@ def test_shuffled_order(calm, tmp_path, row, seeds):
         graph = Graph()
         chain.build(graph, shuffle=seed)
         result = driver.run(graph, Store(tmp_path / str(seed)), driver.RunOptions(executor="inline"))
-        computed += result.total().computed
+        computed += result.counts["computed"]
         wrong += [h.label for h in graph.nodes if h.ref.digest != calm["labels"][h.label]]
     row("shuffled order of tasks", seeds, [], wrong, computed, seeds * len(calm["digests"]), "inline")
 

@@ -28,7 +28,6 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import memory_limit, settings, settings_of_run
-from rille.stages.core.errors import ConfigError
 
 MAX_REASONS = 3
 """Different reasons of a stage that are printed; ``verbose`` prints each task's."""
@@ -68,10 +67,8 @@ def plan(
     result = run(graph, store, RunOptions(dry=True, force=options.force))
     result.check()
     # A parameter may be read by tasks that are not known yet.
-    lost = [] if result.unknown else unread.unread(settled.given, config, graph)
-    if lost:
-        text = f"{unread.values(lost, config)}: no task of this run reads it"
-        raise ConfigError("RIL-733", text, remedy=unread.remedy(lost, config))
+    if not result.unknown and (lost := unread.unread(settled.given, config, graph)):
+        raise unread.error(lost, config)
     budget = memory.budget(options.executor, memory_limit(options), options.jobs)
     planned = memory.Estimates().planned(graph)
     workers = budget.workers(max((needs for _, needs in planned), default=0.0))

@@ -113,7 +113,7 @@ class _Watched:
         except InputError as error:
             if self.taken is None and not isinstance(error, IncompleteError):
                 raise
-            # Files that do not rest yet are no files: what lacks is known once they do.
+            # Files that still change are not counted: whether one is missing is known once all are at rest.
             if time.monotonic() - self.arrivals.changed > SETTLE_SECONDS:
                 self.say(f"rille: waiting: {error.message}")
             return None

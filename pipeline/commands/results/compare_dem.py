@@ -27,7 +27,7 @@ from rille.pipeline.export.read_dem import (
 )
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, named
+from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.evaluation import dem_changes
@@ -73,7 +73,7 @@ def compare_dem(
         Files to write, without ending.
     """
     paths = [lookup.elevation(text, runs) for text in (a, b)]
-    raster, facts = named(output, ".tif"), named(output, ".json")
+    raster, facts = output_file(output, ".tif"), output_file(output, ".json")
     check_output(raster, others={(p / "dem.tif" if p.is_dir() else p).resolve(): "a model" for p in paths})
     one, other = (read_elevation(path) for path in paths)
     place = None

@@ -9,13 +9,10 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs.run_artifacts import export_run
+from rille.pipeline.export.programs.run_artifacts import FILES, export_run
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.stages.core.errors import ConfigError
-
-FILES = {"laz": "cloud.laz", "ply": "cloud.ply", "glb": "terrain.glb"}
-"""Name of the file of a form, in the run's folder; any other form is a folder of the form's name."""
 
 Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
 

@@ -25,7 +25,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, write_trajectory_tum
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, named
+from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.evaluation.place import place
@@ -59,7 +59,7 @@ class Area:
     within: Annotated[float | None, Parameter(validator=Number(gt=0))] = None
 
     def around(self) -> SearchArea | None:
-        """The same in numbers; None: everywhere.
+        """The area in numbers; None: everywhere.
 
         Raises
         ------
@@ -151,7 +151,7 @@ def localize(
     output
         Files to write, without ending.
     """
-    written = [named(output, ".json")]
+    written = [output_file(output, ".json")]
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
     folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
@@ -173,7 +173,7 @@ def localize(
         why = f"{error.code}: {error}"
     # Where the place is not known now, files of an earlier one would be taken for its.
     for ending in (".tum", ".gpkg"):
-        named(output, ending).unlink(missing_ok=True)
+        output_file(output, ending).unlink(missing_ok=True)
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else for_file(found))}
     atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
@@ -225,13 +225,13 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
 
 def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store) -> Iterator[Path]:
     """Write trajectory and path in the map's coordinates; gives the files."""
-    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {named(output, '.json').name}"
+    words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {output_file(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
         known = api.Run(folder).trajectory
         turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
         poses = np.concatenate([turned, there[..., None]], axis=2)
-        write_trajectory_tum(named(output, ".tum"), poses, known["time"].values.tolist(), words)
-        yield named(output, ".tum")
+        write_trajectory_tum(output_file(output, ".tum"), poses, known["time"].values.tolist(), words)
+        yield output_file(output, ".tum")
     try:
         with lookup.reading(folder):
             planned = RunArtifacts(folder, store).find("path/world")
@@ -240,5 +240,5 @@ def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store
         return
     if planned is not None:
         moved = Bundle({"path": found.pose.apply(np.asarray(planned["path"]))}, {**planned.meta, "frame": words})
-        write_path(named(output, ".gpkg"), moved, Georeference(crs or MAP_CRS, (0.0, 0.0, 0.0), 0.0))
-        yield named(output, ".gpkg")
+        write_path(output_file(output, ".gpkg"), moved, Georeference(crs or MAP_CRS, (0.0, 0.0, 0.0), 0.0))
+        yield output_file(output, ".gpkg")

@@ -35,7 +35,7 @@ from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.shading import gradient
 
 MAX_CELL_RATIO = 1.5
-"""Of two runs' cells: coarser ones would be interpolated between, finer ones left out."""
+"""Ratio of two runs' cell sizes: coarser cells would be interpolated between, finer ones left out."""
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ def _table(found: Joint) -> Iterator[str]:
     yield "  ".join([f"{'degrees':17s}", *(f"{head:>17.17s}" for head in ["all", *heads])])
     for k, p in enumerate(found.parameters):
         value = found.values[k] if p.freed else p.asked
-        # Of what no image shows, an estimate is the prior.
+        # Where no image shows a parameter, its estimate would be the prior.
         own = [(one.values[k], one.sigma[k]) for one in found.estimates if p.observed]
         each = [(value, p.sigma), *own]
         cells = "  ".join(f"{math.degrees(v):+8.3f} +- {math.degrees(s):.3f}" for v, s in each)

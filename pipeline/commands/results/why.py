@@ -80,8 +80,9 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
 
 
 def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None, store: Store) -> Iterable[str]:
-    reason = f"an artifact of the same key was there{_computed_by(row, run)}"
-    yield f"why           {reason if row['status'] == 'cached' else row.get('reason', '')}"
+    cached = row["status"] == "cached"
+    reason = f"an artifact of the same key was there{_computed_by(row, run)}" if cached else row.get("reason", "")
+    yield f"why           {reason}"
     if row["status"] == "computed":
         yield f"took          {row['seconds']:.2f} s, of which the stage itself {row['kernel']:.2f} s"
     if "digest" in row:

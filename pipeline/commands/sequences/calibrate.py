@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
@@ -25,8 +26,6 @@ from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
-
-SIDES = ("left", "right")
 
 SAME_PLACE_PX = 1.0
 """RMS distance of all corners below which two views show the board at one place: noise moves them by tenths, a hand by
@@ -65,7 +64,7 @@ class Boards:
             return f"its images are not {most} pixels as most are"
         left, right = (chessboard.find_corners(image, self.corners) for image in images)
         if left is None or right is None:
-            missing = [side for side, points in zip(SIDES, (left, right), strict=True) if points is None]
+            missing = [side for side, points in zip(CAMERAS, (left, right), strict=True) if points is None]
             return f"no whole board in the {' nor in the '.join(missing)} image"
         view = BoardView(name, left, chessboard.same_order(left, right, self.corners))
         same = next((other.name for other in self.views if _distance(view, other) < SAME_PLACE_PX), None)
@@ -204,7 +203,7 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
-    for side, size in zip(SIDES, boards.sizes, strict=True):
+    for side, size in zip(CAMERAS, boards.sizes, strict=True):
         share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
         if share > MAX_FOCAL_SIGMA:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"

@@ -15,7 +15,6 @@ from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.flow import config
 from rille.pipeline.runs.options import COMPLETE, Assignments, CacheFolder, cache_folder
-from rille.stages.core.errors import ConfigError
 
 app = App(name="datasets", help=__doc__)
 
@@ -40,10 +39,8 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
     directory
         Folder to make; it must not exist yet or be empty.
     """
-    for_dataset, others = config.split_dataset(config.parse_assignments(assignments))
-    if others:
-        text = f"--set {next(iter(others))}: not a section of a sequence"
-        raise ConfigError("RIL-063", text, remedy="set mockup.key=value")
+    for_dataset = config.parse_assignments(assignments)
+    config.refuse_other_sections(for_dataset, config.DATASET_SECTIONS, "datasets export")
     place = cache_folder(cache)
     store = Store(place)
     # Before minutes of rendering.

@@ -38,7 +38,7 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"
         raise InputError("RIL-906", text, remedy="draw the mask by hand")
-    # Of a camera: more tell no more
+    # Twenty images: more would not change the mask.
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, 20).round().astype(int))]
     written = []
     for camera in CAMERAS:

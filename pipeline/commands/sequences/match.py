@@ -56,11 +56,7 @@ class Matcher:
             They are of another section, or contradict the preset.
         """
         nested = configuration.parse_assignments(self.assignments)
-        others = [section for section in nested if section != "hfvm"]
-        if others:
-            # Refused, not passed over: nothing here reads another section.
-            text = f"--set {others[0]}: match has the section hfvm only"
-            raise ConfigError("RIL-046", text, remedy="write --set hfvm.key=value")
+        configuration.refuse_other_sections(nested, ("hfvm",), "match")
         values: dict[str, Any] = dict(nested.get("hfvm", {}))
         if self.preset is not None and values.setdefault("preset", self.preset) != self.preset:
             text = f"--preset {self.preset} and --set hfvm.preset={values['preset']} contradict each other"

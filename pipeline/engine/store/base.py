@@ -46,6 +46,12 @@ class NonDeterministicError(RilleError):
     """A stage gave two different results for one key."""
 
 
+def not_deterministic(stage: str, label: str, what: str = "digest") -> NonDeterministicError:
+    """The error of a task whose results differ by ``what``."""
+    text = f"stage {stage} is not deterministic: {label} gave another {what} than before"
+    return NonDeterministicError("RIL-577", text)
+
+
 class GoneError(StoreError):
     """An artifact that was there has gone: cleared away, or set aside as damaged by another run."""
 
@@ -195,7 +201,7 @@ class Store:
                 return there
             old = self.manifest(stage.name, key)
             if there is not None and old is not None:
-                raise NonDeterministicError("RIL-577", manifest.difference(label or key[:12], made, old))
+                raise not_deterministic(stage.name, label or key[:12], manifest.difference(made, old))
         raise StoreError("RIL-573", f"cannot publish {path} in {self.root}", remedy="remove that file and run again")
 
     def set_aside(self, stage: str, key: str, reason: str) -> bool:

@@ -1,7 +1,8 @@
 """A finished run as a COLMAP model: cameras, their rig, poses, and the tracked points with their coordinates.
 
 COLMAP puts the centre of the first pixel at (0.5, 0.5) and stores world-to-camera poses. The rig is the one that was
-computed with; images are those of an ideal camera, so where a lens was undone the files on disk are not the model's.
+computed with; it has number 1, its cameras 1 (left, its origin) and 2. Images are those of an ideal camera, so where a
+lens was undone the files on disk are not the model's.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.arrays import Bytes, Floats
@@ -29,9 +31,6 @@ from rille.stages.terrain.points import colours
 MAX_REPROJECTION_PX = 0.5
 """Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
 resection hardly counted would pull an adjustment away: on a street of 60 m by 0.45 m, with the limit by 0.10 m."""
-
-SIDES = ("left", "right")
-"""The two cameras, numbers 1 and 2; the rig has number 1, and the left camera is its origin."""
 
 Seen = dict[tuple[int, str], list[Floats]]
 """Pixels (column, row) by COLMAP's centre that show a point, of each image, named by its frame and side."""
@@ -99,13 +98,13 @@ def build(
         if np.isfinite(pose).all()
     }
     # Before images are made: each point adds its pixels to the images that see it.
-    seen: Seen = {(frame, side): [] for frame in poses for side in SIDES}
+    seen: Seen = {(frame, side): [] for frame in poses for side in CAMERAS}
     points = [point for segment in segments for point in _points(segment, rig, poses, seen, images or {})]
     number = {image: k for k, image in enumerate(seen, start=1)}
 
     model = pycolmap.Reconstruction()
     both, body = colmap_rig(rig)
-    cameras = dict(zip(SIDES, both, strict=True))
+    cameras = dict(zip(CAMERAS, both, strict=True))
     for camera in cameras.values():
         model.add_camera(camera)
     model.add_rig(body)
@@ -173,7 +172,7 @@ def _points(
     for k in np.flatnonzero(np.isfinite(world).all(1) & (shown.sum(axis=(1, 2)) > 1)):
         elements = []
         for j, side in np.argwhere(shown[k]):
-            image = frames[j], SIDES[side]
+            image = frames[j], CAMERAS[side]
             elements.append((image, len(seen[image])))
             seen[image].append(pixels[k, j, side] + PIXEL_CENTRE)
         yield world[k], elements, rgb[k]

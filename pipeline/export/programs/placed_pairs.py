@@ -37,7 +37,7 @@ class PlacedPairs:
     """
 
     def __init__(self, run: RunArtifacts, every: int = 1) -> None:
-        """Of each pair each ``every``-th row and column."""
+        """``every``: points of each so many-th row and column of the images alone."""
         trajectory = run.one("trajectory", last=True)
         frames, pieces = trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist()
         self._poses = dict(zip(frames, np.asarray(trajectory["poses"]), strict=True))

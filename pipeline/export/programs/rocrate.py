@@ -26,9 +26,6 @@ METADATA = "ro-crate-metadata.json"
 SPECIFICATION = "https://w3id.org/ro/crate/1.1"
 PROGRAM = "#rille"
 
-RENDERED = ("report.html", "report.json", "frames.json", "config.toml", "ledger.jsonl")
-"""Files that say when and where a run was: those of another run differ, though its results are the same."""
-
 Entity = dict[str, Any]
 
 
@@ -152,7 +149,7 @@ def read(folder: Path) -> Crate:
         for name, value in zip(rest[::2], rest[1::2], strict=True):  # each option of such a command has a value
             options[name] = (*options.get(name, ()), value)
         results = [one["@id"] for one in entities["#run"]["result"]]
-        digests = {str(name): str(entities[name]["sha256"]) for name in results if name not in RENDERED}
+        digests = {str(name): str(entities[name]["sha256"]) for name in results if name not in catalogue.RENDERED}
         if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in digests):
             raise ValueError("a file lies outside of it")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

@@ -17,8 +17,9 @@ from rille.pipeline.export.writers import check_folder
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
-WRITERS = {"laz": "cloud", "ply": "cloud", "glb": "mesh"}
-"""Modules that write files; any other form is a folder, which the module of its name writes."""
+FILES = {"laz": "cloud.laz", "ply": "cloud.ply", "glb": "terrain.glb"}
+"""Forms that are one file, and its usual name; any other is a folder of its own name. The module of that name, without
+ending, writes it."""
 
 
 def export_run(form: str, run: Path, target: Path, store: Store, **thinning: float) -> str:
@@ -36,7 +37,8 @@ def export_run(form: str, run: Path, target: Path, store: Store, **thinning: flo
         ``target`` is a folder that is not empty.
     """
     check_folder(target)
-    write_run = import_module(f"rille.pipeline.export.programs.{WRITERS.get(form, form)}").write_run
+    module = Path(FILES.get(form, form)).stem
+    write_run = import_module(f"rille.pipeline.export.programs.{module}").write_run
     with atomic.replacing(target) as temporary:
         words: str = write_run(temporary, RunArtifacts(run, store), **thinning)
     return words
@@ -78,7 +80,7 @@ class RunArtifacts:
         return {name.partition("/")[2]: self._open(name) for name in names}
 
     def labels(self, pattern: str) -> list[str]:
-        """Of the labels that match a pattern whole, what its group is."""
+        """The group of a pattern in each label that matches it as a whole."""
         return [match[1] for name in self._rows if (match := re.fullmatch(pattern, name))]
 
     def input(self, label: str, port: str) -> Bundle:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import CalibrationFacts
@@ -46,11 +46,9 @@ HERE = RigidTransform.identity()
 
 
 class Features(NamedTuple):
-    """Features of a left image: points (n, 2) column, row, their descriptors (n, 128), and their landmarks in the frame
-    of the camera."""
+    """Features of a left image: points (n, 2) column, row, and their landmarks in the frame of the camera."""
 
     points: Floats
-    descriptors: Floats32
     landmarks: Landmarks
     camera: Camera
 
@@ -168,7 +166,7 @@ def loop_stage(
     def view(k: int) -> Features:
         rig, points = Rig.from_dict(rigs[k].meta["rig"]), np.asarray(features[k]["points"], np.float64) - PIXEL_CENTRE
         known = landmarks_of(points, disparities[k], rig, HERE, usual.disparity_sigma)
-        return Features(points, np.asarray(features[k]["descriptors"], np.float32), known, rig.left)
+        return Features(points, known, rig.left)
 
     factors, refused = list[dict[str, Any]](), list[dict[str, Any]]()
     for k, pair in enumerate(pairs[1:], start=1):

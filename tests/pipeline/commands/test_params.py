@@ -29,7 +29,7 @@ def test_choices_and_bounds_are_told(capsys: pytest.CaptureFixture[str]) -> None
     told = capsys.readouterr().out
     assert 'hfvm.preset = "default"    [\'' in told
     assert "merge." not in told
-    with raises("RIL-920", "'nope'"):
+    with raises("RIL-035", "'nope'"):
         params.params("nope")
-    with raises("RIL-920", "did you mean locus"):
+    with raises("RIL-035", "did you mean locus"):
         params.params("locs")

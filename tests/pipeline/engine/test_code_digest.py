@@ -22,7 +22,7 @@ FILES = {
     "stranger.py": "Y = 1\n",
 }
 
-CACHED = (code_digest._read, code_digest._file, code_digest._roots, code_digest._reachable, code_digest.code_digest)
+CACHED = (code_digest._read, code_digest._file, code_digest._roots, code_digest.module_digests, code_digest.code_digest)
 
 
 @pytest.fixture

@@ -47,7 +47,7 @@ def test_a_second_run_reads_no_manifest_and_finds_the_same(cache):
     before = rows(cache)
     assert len(before) == NODES
     with_index, read, result = run(cache)
-    assert (read, result.total().cached) == ([], NODES)
+    assert (read, result.counts["cached"]) == ([], NODES)
     assert rows(cache) == before
     (cache / index.NAME).unlink()
     without, read, _ = run(cache)
@@ -83,7 +83,7 @@ def test_a_file_that_was_changed_is_read_again(cache, way):
     again, read, result = run(cache)
     assert len(read) >= 1
     assert again["scale/1"][1].digest == ref.digest
-    assert result.total().computed == (way == "flipped")
+    assert result.counts["computed"] == (way == "flipped")
     assert run(cache)[1] == [], "it has a row again"
 
 

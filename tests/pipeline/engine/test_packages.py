@@ -45,12 +45,12 @@ def test_packages_come_from_the_imports_of_all_that_is_reached(tmp_path, monkeyp
     (folder / "main.py").write_text("import json\nfrom own_kit import far\n")
     (folder / "far.py").write_text("from typing import TYPE_CHECKING\ndef f():\n    import cv2.aruco, yaml\n")
     monkeypatch.syspath_prepend(tmp_path)
-    for cached in (code_digest._roots, code_digest._file, code_digest._reachable):
+    for cached in (code_digest._roots, code_digest._file, code_digest.module_digests):
         cached.cache_clear()
     assert code_digest.external_imports("own_kit.main") == {"cv2", "yaml"}
     assert {name.lower() for name in packages.versions("own_kit.main")} == {"opencv-python-headless", "pyyaml"}
     (folder / "far.py").write_text("import no_such_package\n")
-    for cached in (code_digest._read, code_digest._reachable):
+    for cached in (code_digest._read, code_digest.module_digests):
         cached.cache_clear()
     with raises("RIL-530", "no_such_package"):
         packages.versions("own_kit.main")

@@ -73,7 +73,8 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
     assert isinstance(found["die"].error, driver.WorkerDiedError)
     assert found["after"].reason == "die failed"
     assert "UnpicklableError: 1 and 2" in str(found["unpicklable"].error)
-    assert (result.total().failed, result.total().skipped) == (2, 1)
+    assert "mischief.py" in "".join(found["unpicklable"].error.__notes__), "the traceback on the worker"
+    assert (result.counts["failed"], result.counts["skipped"]) == (2, 1)
     children = [p for p in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(p.cmdline())]
     assert gone(children)
 

@@ -98,6 +98,6 @@ def test_sections_without_a_task_in_the_graph_are_told():
     )
     keys = ["motion.level", "vehicle.track", "tiling.tile", "loops.apart"]
     assert unread.unread(keys, config, graph) == ["tiling.tile", "loops.apart"]
-    assert unread.remedy(["loops.apart"], config).startswith("leave it out")
+    assert unread.error(["loops.apart"], config).remedy.startswith("leave it out")
     off = configuration.build({"loops": {"enabled": False}})
-    assert "loops.enabled=true" in unread.remedy(["loops.apart"], off)
+    assert "loops.enabled=true" in unread.error(["loops.apart"], off).remedy

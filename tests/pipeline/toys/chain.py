@@ -62,7 +62,7 @@ def main(cache, executor="inline", what="", ledger=""):
         graph, Store(cache), driver.RunOptions(executor=executor, jobs=2, ledger=Path(ledger) if ledger else None)
     )
     nodes = {h.label: [h.status, h.ref.digest if h.ref else None, h.reason] for h in graph.nodes}
-    print(json.dumps({"ok": result.ok, "workers": result.workers_started, "nodes": nodes}), flush=True)
+    print(json.dumps({"ok": result.ok, "nodes": nodes}), flush=True)
 
 
 if __name__ == "__main__":

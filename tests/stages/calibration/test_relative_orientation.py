@@ -9,8 +9,9 @@ import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.stages.calibration.relative_orientation import (
+    PRINCIPAL,
+    RIG,
     SIZE,
-    SMOOTH,
     TERMS,
     PointPairs,
     Priors,
@@ -52,7 +53,7 @@ def test_smooth_error_is_told_from_the_rig():
     m = matches(knocked(street_rig(), pitch_deg=0.3), street_depth, field=field)
     fit = adjust(street_rig(), [m], ANGLES, PRIORS, rival=True)
     assert np.degrees(fit.x[0]) == pytest.approx(0.3, abs=0.01)
-    assert np.abs(fit.x[SMOOTH]).max() > PRIORS.term / 2
+    assert np.abs(fit.x[RIG + PRINCIPAL : SIZE]).max() > PRIORS.term / 2
 
 
 def test_images_without_smooth_error_are_as_certain_as_is_believed_of_rows():

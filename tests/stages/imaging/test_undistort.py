@@ -151,5 +151,5 @@ def test_stage():
 def test_image_of_another_size_is_named():
     with raises("RIL-454", "frame 7", "300 x 200", "376 x 240"):
         run(np.zeros((200, 300), np.uint8), LENSES["radtan"], RAW)
-    with raises("RIL-455"):
+    with raises("RIL-413"):
         undistort.undistort(np.zeros((240, 376), np.uint8), Lens(RAW), RAW, np.ones((3, 3)))

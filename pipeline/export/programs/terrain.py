@@ -79,12 +79,6 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     return f"{len(vertices)} vertices, {len(faces)} triangles{every}"
 
 
-def _colours(ortho: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Red, green and blue (rows, cols, 3) of an ortho image, grey or coloured; grey where it has no value."""
-    bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
-    return np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN_GREY), 0, 255)).astype(np.uint8)
-
-
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
     """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
     z = terrain.grid.values[::step, ::step]
@@ -108,12 +102,14 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _texture(ortho: Layer) -> Any:
+    """Material in the colours of an ortho image, grey where it has no value."""
     if ortho is None:
         return None
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
 
-    image = Image.fromarray(_colours(ortho))
+    bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
+    image = Image.fromarray(np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN_GREY), 0, 255)).astype(np.uint8))
     if max(image.size) > MAX_TEXTURE_PX:
         image.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
     # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.

@@ -13,8 +13,8 @@ from raising import raises
 from terrain_runs import LATTICE, elevation, finished
 
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs import mesh
 from rille.pipeline.export.programs.run_artifacts import export_run
+from rille.pipeline.export.programs.terrain import UNSEEN_GREY, write_glb
 from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.export.writers import Meaning, write_raster
 
@@ -86,7 +86,7 @@ def test_accessors_are_within_their_views_and_state_their_bounds(tmp_path: Path)
 
 
 def test_large_terrain_is_thinned_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh, "MAX_FACES", 2000)
+    monkeypatch.setattr("rille.pipeline.export.programs.terrain.MAX_FACES", 2000)
     path, words = exported(finished(tmp_path))
     assert "every 2. cell" in words
     assert len(trimesh.load(path).to_geometry().faces) <= 2000
@@ -107,8 +107,8 @@ def test_cells_without_an_image_are_grey(tmp_path: Path) -> None:
     terrain = read_elevation(finished(tmp_path))
     look = np.full(KNOWN.shape, np.nan)
     look[KNOWN] = np.where(np.arange(KNOWN.sum()) == 0, 7.0, np.nan)
-    mesh.write_glb(tmp_path / "a.glb", terrain, look)
-    assert texture(tmp_path / "a.glb").tolist() == [7, mesh.UNSEEN_GREY]
+    write_glb(tmp_path / "a.glb", terrain, look)
+    assert texture(tmp_path / "a.glb").tolist() == [7, UNSEEN_GREY]
 
 
 def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -> None:
@@ -117,4 +117,4 @@ def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -
     bands[:, 20:25] = 0  # 0 means unknown in the file
     write_raster(run / "ortho.tif", dict(zip(("red", "green", "blue"), bands, strict=True)), LATTICE, Meaning(nodata=0))
     path, _ = exported(run)
-    assert texture(path).tolist() == [90, mesh.UNSEEN_GREY]
+    assert texture(path).tolist() == [90, UNSEEN_GREY]
