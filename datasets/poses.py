@@ -104,7 +104,7 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     warnings: tuple[str, ...] = ()
     if "time" in columns:
         # Trackers that have lost their target write zeros.
-        turned: AnyArray = table.values([columns[q] for q in QUATERNION if q in columns]).any(axis=1)
+        turned = np.asarray(table.values([columns[q] for q in QUATERNION if q in columns]).any(axis=1))
         table, warnings = table.measured(list(columns.values()), ~turned if "qw" in columns else False)
     times = times_of(table, columns["time"]) if "time" in columns else None
     rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)

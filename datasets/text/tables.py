@@ -59,7 +59,7 @@ class TextTable:
 
         Where no row is left, all are: whoever reads them says what is wrong.
         """
-        missing: AnyArray = np.isnan(self.values(columns)).any(axis=1) | lost
+        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | lost)
         if missing.all() or not missing.any():
             return self, ()
         kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
