@@ -10,6 +10,7 @@ frame's moment, and used only where it is steady, as large as gravity, and the s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,8 +52,11 @@ GAP = 2.5
 """The same of a slow sensor, in median spacings: one missing sample (2) is common, more is not."""
 
 
-GYROSCOPE, ACCELEROMETER = ("gyr", "w_", "ang", "omega", "rate"), ("acc", "a_", "lin", "force")
-"""How names of columns begin."""
+GYROSCOPE = re.compile(r"(.*[./])?(gyr|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
+ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
+"""How names of columns begin, behind the path of a field of a message of ROS."""
+
+DEGREES = re.compile(r"deg|dps|\N{DEGREE SIGN}")
 
 ORDER = ([1, 2, 3], [4, 5, 6])
 """Columns of rates and forces where no names tell."""
@@ -66,6 +70,7 @@ class ImuRecord:
     rates: Floats
     forces: Floats
     name: str = "imu"
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,16 +114,17 @@ def read_imu(path: Path) -> ImuRecord:
         text = f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record"
         raise InputError("RIL-186", text, remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row")
     gyro, accelerometer = _columns(table)
+    table, warnings = table.measured([0, *gyro, *accelerometer])
     times = times_of(table, 0)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
-    if any("deg" in table.header[k] for k in gyro if table.header):
+    if any(DEGREES.search(table.header[k]) for k in gyro if table.header):
         rates = np.deg2rad(rates)
     # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
     _possible(rates, 200.0, "rad/s", table)
     # m/s^2; accelerometers for shocks reach 500 times gravity
     _possible(forces, 5000.0, "m/s^2", table)
     _plausible(rates, forces, table.name)
-    return ImuRecord(np.array(times), rates, forces, table.name)
+    return ImuRecord(np.array(times), rates, forces, table.name, warnings)
 
 
 def _columns(table: TextTable) -> tuple[list[int], list[int]]:
@@ -134,9 +140,9 @@ def _columns(table: TextTable) -> tuple[list[int], list[int]]:
     return gyro, accelerometer
 
 
-def _named(table: TextTable, starts: tuple[str, ...]) -> list[int]:
+def _named(table: TextTable, starts: re.Pattern[str]) -> list[int]:
     """The three columns whose names begin so, x y z; none where there are not just three."""
-    found = [k for k, name in enumerate(table.header) if name.startswith(starts)]
+    found = [k for k, name in enumerate(table.header) if starts.match(name)]
     return found if len(found) == 3 else []
 
 
@@ -233,7 +239,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         force = parts[p].up(moment) if p is not None else None
         attitude.append(None if R_reference_imu is None else rows_of(orthonormal(R_reference_imu @ R_imu_left)))
         up.append(None if force is None else _unit(R_imu_left.T @ force))
-    warnings = coverage(attitude, at, f"attitude from {imu.name}")
+    warnings = (*imu.warnings, *coverage(attitude, at, f"attitude from {imu.name}"))
     return Inertial(tuple(attitude), tuple(up), rows_of(R_imu_left), warnings, notes)
 
 

@@ -28,6 +28,7 @@ from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
@@ -40,16 +41,25 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
 WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
+PATH = r"(?:.*[./])?"
+"""Of a field of a message of ROS, as tools write it before its name."""
+
 WORDS = (
-    (re.compile(r"(t|time|timestamp|stamp|secs?|seconds|nanoseconds)"), lambda m: "time"),
-    (re.compile(r"(?:q|quat|quaternion|orientation|rot|q_rs)[_. ]?([wxyz])"), lambda m: "q" + m[1]),
+    (re.compile(r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow"), lambda m: "time"),
+    (re.compile(rf"{PATH}(?:q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[1]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
+    (re.compile(rf"{PATH}(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
     (re.compile(r"up|height|alt|altitude|elevation"), lambda m: "z"),
 )
 
+
+FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
+"""Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one."""
+
+DEGREES = re.compile(r"\b(lat|lon)")
 
 TIME_UNIT = re.compile(r"[\[(_ ](s|ms|us|ns)[\])]?$")
 """At the end of the name of a column of times."""
@@ -64,11 +74,13 @@ class TimedPoses:
     times : seconds, increasing; None where the file has none, and rows are frames.
     poses : T_reference_body, metres, one a row; None of a row of NaN.
     name : the file, for messages.
+    warnings : on rows that were left out.
     """
 
     times: tuple[float, ...] | None
     poses: tuple[RigidTransform | None, ...]
     name: str = "poses"
+    warnings: tuple[str, ...] = ()
 
 
 def read_poses(path: Path, format: str = "auto") -> TimedPoses:
@@ -89,12 +101,17 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
         return TimedPoses(None, _matrices(table), table.name)
     columns = _columns(table, format, meant)
+    warnings: tuple[str, ...] = ()
+    if "time" in columns:
+        # Trackers that have lost their target write zeros.
+        turned = np.asarray(table.values([columns[q] for q in QUATERNION if q in columns]).any(axis=1))
+        table, warnings = table.measured(list(columns.values()), ~turned if "qw" in columns else False)
     times = times_of(table, columns["time"]) if "time" in columns else None
     rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)
     placed = [columns[axis] for axis in POSITION if axis in columns]
     positions = table.numbers(placed) if len(placed) == 3 else np.zeros((len(table.rows), 3))
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
-    return TimedPoses(times, poses, table.name)
+    return TimedPoses(times, poses, table.name, warnings)
 
 
 @dataclass(frozen=True)
@@ -104,6 +121,7 @@ class TimedPositions:
     times: tuple[float, ...] | None
     positions: tuple[tuple[float, ...], ...]
     name: str
+    warnings: tuple[str, ...]
 
 
 def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) -> TimedPositions | None:
@@ -126,18 +144,35 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
+    degrees = any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header)
     if not columns and (_whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
         return None
-    if len(known) < 2:
+    if len(known) < 2 or degrees:
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
-        if any(name.lower().startswith(("lat", "lon")) for name in table.header):
+        if any(map(DEGREES.search, table.header)):
             remedy = "project latitude and longitude to metres, as UTM has them, in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
-    times = times_of(table, meant["time"]) if "time" in meant else None
-    rows = table.numbers([meant[axis] for axis in POSITION if axis in meant])
-    return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name)
+    placed = [meant[axis] for axis in POSITION if axis in meant]
+    placed = [k for k in placed if not np.isnan(table.values([k])).all()] or placed
+    times, warnings = None, tuple[str, ...]()
+    if "time" in meant:  # else rows are pairs
+        table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
+        times = times_of(table, meant["time"])
+    rows = table.numbers(placed)
+    return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+
+
+def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
+    """Whether a receiver had no position in a row: its quality is 0, or x and y are, a kilometre from all others."""
+    away = np.hypot(*table.values([x, y]).T)
+    # m; no vehicle jumps so far
+    missing: AnyArray = (away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)
+    for k in [k for k, name in enumerate(table.header) if FIX.fullmatch(name)]:
+        quality = table.values([k])[:, 0]
+        missing |= (quality == 0) & bool((quality > 0).any())
+    return missing
 
 
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:

@@ -125,6 +125,10 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if name_or_path in MANIFESTS:
         return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
     path, number = _split(name_or_path)
+    # os.path, for pathlib raises where a name is too long, or no name.
+    if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
+        kind = "file" if path.suffix else "sequence"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=_suggestion(name_or_path))
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # What the user wrote down goes before what the folder looks like.
@@ -139,9 +143,6 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "give the folder, of a ROS 2 bag too, or a manifest (.toml); `rille init FOLDER` writes one"
         remedy = "; ".join([*unread([name_or_path]), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
-    if not path.is_dir() or not name_or_path:
-        kind = "file" if path.suffix else "sequence"
-        raise InputError("RIL-276", f"no {kind} {name_or_path!r}", remedy=_suggestion(name_or_path))
     beside = Path(f"{path}.rille.toml")
     remedy = (
         f"give its manifest, {beside}"
@@ -188,7 +189,7 @@ def _split(name_or_path: str) -> tuple[Path, str | None]:
     path = Path(os.path.expanduser(name_or_path))
     root, colon, number = name_or_path.rpartition(":")
     # A path that exists is taken whole: folders may have a colon in their names.
-    if not path.exists() and colon and root:
+    if not os.path.exists(path) and colon and root:
         return Path(os.path.expanduser(root)), number
     return path, None
 

@@ -126,7 +126,7 @@ def reconstruct_many(
     ['InputError', 'InputError']
     """
     ended: list[Run | RilleError] = []
-    for seq in seqs:
+    for seq in [seqs] if isinstance(seqs, str | Path | StereoSequence) else seqs:
         try:
             ended.append(reconstruct(seq, client, **same))
         except RilleError as error:

@@ -199,14 +199,15 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Raises
     ------
     InputError
-        An image is not grey, or its values are floating point from 0 to 1, normalised, or 8 bits in 16.
+        An image is not grey, or its values are floating point from 0 to 1, or normalised.
     ConfigError
         A parameter is unknown, or not permitted.
 
     Warns
     -----
     UserWarning
-        Hardly a pixel matches, most have no texture, or left and right seem swapped.
+        Hardly a pixel matches, most have no texture, left and right seem swapped, or samples of 16 bits use a small
+        part of their range and are spread.
 
     Examples
     --------
@@ -220,7 +221,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     """
     prepare_environment()
     from rille.pipeline.flow import config, tiles
-    from rille.pipeline.runs.doubts import doubts
+    from rille.pipeline.runs.doubts import doubts, levelled
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
 
@@ -228,25 +229,27 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     built: Any = config.build(carried, {"hfvm": hfvm})
     left, right = map(_rows_first, (left, right))
     images = [np.asarray(image) for image in (left, right)]
+    images = [image.astype(image.dtype.newbyteorder("="), copy=False) for image in images]
     for camera, image in zip(("left", "right"), images, strict=True):
         if image.dtype.kind in "OSU":  # a path, or nothing
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
             raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
-        if image.dtype.kind == "f" or np.issubdtype(image.dtype, np.uint16):
+        if image.dtype.kind == "f":
             low, high = float(np.nanmin(image, initial=0)), float(np.nanmax(image, initial=0))
-            full = 255 if image.dtype.kind == "f" else 65535
-            # From 0 to 1, or with the mean removed and the deviation made 1; 8 bits in 16, or 16 in floating point.
-            if 0 < high <= full / 255 or (low < 0 and high - low < 16) or high > 2 * full:
-                values = f"the {camera} image's values lie from {low:.3g} to {high:.3g}"
-                text = f"{values}: {image.dtype} is taken as 0..{full}"
-                raise InputError("RIL-973", text, remedy=f"scale them to 0..{full}")
+            # From 0 to 1, or with the mean removed and the deviation made 1; 16 bits in floating point.
+            if 0 < high <= 1 or (low < 0 and high - low < 16) or high > 2 * 255:
+                text = f"the {camera} image's values lie from {low:.3g} to {high:.3g}: {image.dtype} is taken as 0..255"
+                raise InputError("RIL-973", text, remedy="scale them to 0..255")
+    spread = list[str]()
+    if "valid" not in getattr(left, "coords", ()):  # images of a sequence are spread as its others
+        images, spread = levelled(images)
     valid = [_valid(image) for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
     disparity = match_pyramids(first, second, built.hfvm, how=how)
     arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
     meta = facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
-    for line in doubts(disparity, *images, closely=False):
+    for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)
     return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
 
@@ -286,6 +289,8 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     ------
     InputError
         The disparity is not that of an image of this size.
+    ConfigError
+        ``every`` is no whole number from 1.
 
     Examples
     --------
@@ -301,6 +306,9 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     from rille.stages.terrain.points import colours
     from rille.stages.terrain.points import points as points_of
 
+    if not isinstance(every, int | np.integer) or not 1 <= every < 2**31:
+        text = f"every = {every!r:.80} is no step from row to row"
+        raise ConfigError("RIL-867", text, remedy="give a whole number, 1 for all rows and columns")
     given = _disparity(disparity, pair)
     found = points_of(given, pair.sequence.rig, every)
     left: Bundle = Bundle({"image": np.asarray(pair.left)}, {})

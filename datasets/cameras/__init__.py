@@ -86,9 +86,10 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
 
 def _read(text: str, path: Path) -> list[CalibratedCamera]:
     # Before YAML, for which KITTI's `P0: 7.1 0 ...` is an entry, too: one word where twelve numbers belong.
+    plain = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
     for recognises, read in PLAIN:
-        if recognises(text):
-            return read(text, path)
+        if recognises(plain):
+            return read(plain, path)
     fields = Fields(parse_nested(text, str(path)), str(path))
     for knows, read_fields in NESTED:
         if knows(fields):

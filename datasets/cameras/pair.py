@@ -81,11 +81,12 @@ def rig_of(
 
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     if camera.size is not None and size is not None and camera.size != size:
+        turned = " (turned by their tag: magick mogrify -auto-orient FILES)" if camera.size == size[::-1] else ""
         raise InputError(
             "RIL-131",
             f"camera {camera.name} is calibrated for {camera.size[0]} x {camera.size[1]} pixels, "
             f"the images are {size[0]} x {size[1]}",
-            remedy="give the images as they were calibrated, or the calibration of images of this size",
+            remedy=f"give the images as they were calibrated{turned}, or the calibration of images of this size",
         )
     if camera.size is None and size is None:
         text = f"the calibration of camera {camera.name} does not say how large its images are"

@@ -78,7 +78,7 @@ def _bits(image: Any) -> int:
     """Bits a sample."""
     if image.format == "TIFF":
         return int(image.tag_v2.get(258, (1,))[0])  # BitsPerSample
-    if image.format in ("JPEG", "BMP"):
+    if image.format in ("JPEG", "MPO", "BMP"):  # Pillow's name of a JPEG with a preview behind it, as drones write
         return 8
     # Layouts of two bytes a sample have "16" in their names; beside others stands a netpbm file's greatest value.
     layout = image.tile[0].args

@@ -81,6 +81,10 @@ class MotionReader:
         """Enter something into the sequence."""
         self.sequence = replace(self.sequence, **found)
 
+    def warn(self, lines: tuple[str, ...]) -> None:
+        """Enter warnings into the sequence."""
+        self.state(warnings=(*self.sequence.warnings, *lines))
+
     def times(self, section: Times) -> tuple[float, ...]:
         """Time of each pair, s; of one without a row of its own between its neighbours.
 
@@ -117,8 +121,8 @@ class MotionReader:
         lines = read_lines(path, "times")
         if self.growing and not path.read_bytes().endswith(b"\n"):  # whoever writes it has not come to the line's end
             del lines[-1:]
-        header, rows = tuple[str, ...](), list[tuple[str, int]]()
-        images, by_name = False, dict[str, tuple[str, int]]()
+        header, found, at = tuple[str, ...](), list[list[str]](), list[int]()
+        images, by_name = False, dict[str, int]()
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
             cells = split(text.removeprefix("#"), next((s for s in ",;\t" if s in text), None))
@@ -129,13 +133,17 @@ class MotionReader:
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
             stated = [cell for title, cell in titles.items() if re.search("time|stamp", title, re.I)]
-            rows.append((next((cell for cell in stated if NUMBER.match(cell)), others[0]).split()[0], k))
+            found.append([cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]])
+            at.append(k)
             images = images or bool(names)
-            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: rows[-1] for cell in names or cells[1:2]}
+            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(at) - 1 for cell in names or cells[1:2]}
+        column = int(_counts(found))
+        rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
-            return [by_name.get(pair.left.stem) for pair in self.pairs]
+            places = [by_name.get(pair.left.stem) for pair in self.pairs]
+            return [None if k is None else rows[k] for k in places]
         rows = list(self.arrived(rows))
         if images or len(rows) not in self.counts():
             more = f", none of {absent}" if by_name else ""
@@ -162,6 +170,7 @@ class MotionReader:
         """T_reference_left of each pair from a file of poses of a body."""
         path = self.root / section.file
         timed = read_poses(path, section.format)
+        self.warn(timed.warnings)
         unit = section.unit if isinstance(section, PoseFile) else 1.0
         poses: Poses = tuple(p and RigidTransform(p.rotation, unit * p.translation) for p in timed.poses)
         if timed.times is not None:
@@ -170,8 +179,7 @@ class MotionReader:
                 raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
             moved = replace(timed, poses=poses, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
-            gaps = coverage(poses, self.sequence.times, f"{table} ({path.name})")
-            self.state(warnings=(*self.sequence.warnings, *gaps))
+            self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
         elif len(self.arrived(poses)) in self.counts():
             poses = tuple(self.one_a_pair(self.arrived(poses)))
         else:
@@ -228,6 +236,7 @@ class MotionReader:
         IncompleteError
             They or the pairs have no times, and they are not one a pair.
         """
+        self.warn(found.warnings)
         rows = tuple(tuple(section.unit * v for v in row) for row in found.positions)
         if found.times is not None and self.sequence.times is not None:
             return rows, tuple(t + section.time_offset for t in found.times)
@@ -286,3 +295,14 @@ class MotionReader:
             notes=(*sequence.notes, *inertial.notes),
             warnings=(*sequence.warnings, *inertial.warnings),
         )
+
+
+def _counts(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether the first cells number the rows, and the second ones are times."""
+    cells = [row[:2] for row in rows if len(row) > 1 and NUMBER.match(row[0]) and NUMBER.match(row[1])]
+    if len(cells) < max(2, len(rows)):
+        return False
+    number, time = np.array(cells, dtype=float).T
+    steps = np.diff(time)
+    counted = number[0] in (0, 1) and (np.diff(number) == 1).all() and (steps > 0).all()
+    return bool(counted and (time[0] > 1e8 or (steps != 1).any()))

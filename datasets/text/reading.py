@@ -11,6 +11,7 @@ import os
 import re
 import stat
 import tomllib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BufferedReader
@@ -114,7 +115,7 @@ def read_bytes(path: Path, what: str, most: int) -> bytes:
 
 
 def read_text(path: Path, what: str, most: int = SMALL) -> str:
-    """Text of a regular file in UTF-8, with or without a byte order mark.
+    """Text of a regular file in UTF-8, or in UTF-16 with a byte order mark, its lines ended by line feeds alone.
 
     Raises
     ------
@@ -123,7 +124,9 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
     """
     data = read_bytes(path, what, most)
     try:
-        text = data.decode("utf-8-sig")
+        # As PowerShell's redirection and spreadsheets write it
+        text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         # No text, like a file with zero bytes: both are refused below.
         text = "\0"

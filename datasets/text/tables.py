@@ -1,7 +1,8 @@
 """Tables of numbers in text files, as sensors and other programs write them: cells as text, lines remembered.
 
-Columns are parted by commas, semicolons or blanks. The last line of words before the first row names the columns,
-with or without a leading ``#``; later comments are passed over.
+Columns are parted by commas, semicolons, tabs or blanks. The last line of words before the first row names the columns,
+with or without a leading ``#`` or ``%``; later comments are passed over. A date and time of day at the beginning of a
+row is a number of seconds. A cell may be empty, which is no number.
 """
 
 from __future__ import annotations
@@ -9,17 +10,25 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
+from rille.datasets.text.count import count
+from rille.datasets.text.reading import GREATEST, read_lines
+from rille.datasets.text.times import undated
+from rille.datasets.text.warning import warning
+from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
+Lines = tuple[str, ...]
+COMMENTS = ("#", "%", "//")
+NOTHING = ("", "-", "na", "n/a", "null", "none")
+"""In a cell of what was not measured, beside NaN."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,24 @@ class TextTable:
         """One column as it is written: exact, where a float would lose the last digits of a time stamp."""
         return [row[column] for row in self.rows]
 
+    def values(self, columns: Sequence[int]) -> NDArray[np.float64]:
+        """Columns as numbers (rows, columns); NaN where nothing was measured, infinity where there is no number."""
+        return np.array([[_number(row[column]) for column in columns] for row in self.rows])
+
+    def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, Lines]:
+        """The table without rows that say nothing in a column, or are ``lost``, and a warning that counts them.
+
+        Where no row is left, all are: whoever reads them says what is wrong.
+        """
+        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | lost)
+        if missing.all() or not missing.any():
+            return self, ()
+        kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
+        rows, lines = zip(*kept, strict=True)
+        text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement left out"
+        first = self.lines[int(missing.argmax())]
+        return replace(self, rows=rows, lines=lines), (warning("RIL-706", f"{text}, the first in line {first}"),)
+
     def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
         """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` rows may be NaN as a whole.
 
@@ -49,7 +76,7 @@ class TextTable:
         InputError
             A cell is no such number; the message names the line.
         """
-        values = np.array([[_number(row[column]) for column in columns] for row in self.rows])
+        values = self.values(columns)
         wrong = ~(np.abs(values) < GREATEST) & ~(gaps & np.isnan(values).all(axis=1, keepdims=True))
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
@@ -60,9 +87,9 @@ class TextTable:
 
 
 def _number(cell: str) -> float:
-    """Number of a cell; infinity where it is none."""
+    """Number of a cell; NaN of one that says nothing, infinity of any other text."""
     try:
-        return float(cell)
+        return math.nan if cell.lower() in NOTHING else float(cell)
     except ValueError:
         return math.inf
 
@@ -80,35 +107,41 @@ def read_table(path: Path, what: str) -> TextTable:
         It cannot be read, has no rows, or rows differ in length.
     """
     lines = read_lines(path, what)
-    names, separator = "", None
+    names, separator, columns = "", None, 0
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
     for k, line in enumerate(lines, start=1):
-        text = line.strip()
-        if not text or (rows and text.startswith("#")):
+        # Tabs at the end may part cells that are empty.
+        text = (undated(line) if DATE.match(line) else line).lstrip().rstrip(" ")
+        if not text or (rows and text.startswith(COMMENTS)):
             continue
         if not rows:
             # Set anew by every line up to the first row, which decides: a comment above it may hold a comma.
-            separator = next((s for s in (",", ";") if s in text), None)
-        row = split(text, separator)
+            separator = next((s for s in ",;" if s in text), None)
+            columns = len(split(names, separator or ("\t" if "\t" in names else None)))
+        row = split(text, separator, columns)
         if not rows and not NUMBER.match(row[0]):
-            names = text.lstrip("#").strip()
+            names = text.lstrip("#%").strip()
             continue
-        if rows and len(row) != len(rows[0]):
-            text = f"{path}, line {k}: {len(row)} columns where the first row has {len(rows[0])}"
+        if rows and len(row) != columns:
+            text = f"{path}, line {k}: {len(row)} columns where the first row has {columns}"
             raise InputError("RIL-285", text, remedy="correct or remove that line")
+        columns = len(row)
         rows.append(row)
         at.append(k)
     if not rows:
-        dated = any(DATE.match(line) for line in lines[:SAMPLE])
-        remedy = "write times as seconds, not as dates" if dated else "check that it is the right file"
-        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy=remedy)
-    header = split(names, separator) if names else ()
-    header = header if len(header) == len(rows[0]) else ()
+        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+    header = split(names, separator, columns)
+    header = header if len(header) == columns else ()
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
 
 
-def split(text: str, separator: str | None) -> tuple[str, ...]:
-    """Cells of a line without their quotes; a separator at its end makes no cell."""
+def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:
+    """Cells of a line without their quotes; a separator at its end makes no cell, unless that makes ``columns``.
+
+    Without a separator blanks part them, and tabs alone where that makes ``columns``.
+    """
+    if separator is None and len(text.split()) != columns == text.count("\t") + 1:
+        separator = "\t"
     cells = [cell.strip().strip("\"'").strip() for cell in text.split(separator)]
-    return tuple(cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells)
+    return tuple(cells[:-1] if separator and len(cells) not in (1, columns) and not cells[-1] else cells)

@@ -24,17 +24,18 @@ UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d([-_/]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
-    r"(?:\.(\d+)|[-_]?(\d{3}))?(?:Z|\+00:00)?(?!\d)"
+    r"(?:\.(\d+)|[-_]?(\d{3}))?(Z|\+\d\d:?\d\d|-\d\d:\d\d| [-+]\d\d:?\d\d)?(?!\d)"
 )
-"""Date and time of day, with a fraction or milliseconds, as logs and names of files have them."""
+"""Date and time of day, with a fraction or milliseconds and a zone, as logs and names of files have them."""
 
 
 def undated(text: str) -> str:
-    """The text with seconds since 1970 in the place of a date and time of day, which is taken for UTC."""
+    """The text with seconds since 1970 in the place of a date and time of day, for UTC where it has no zone."""
 
     def since(match: re.Match[str]) -> str:
         with suppress(ValueError):  # no day of a calendar
-            moment = datetime.fromisoformat(re.sub("[-_:/]", "", f"{match[1]}T{match[3]}Z"))
+            local = re.sub("[-_:/]", "", f"{match[1]}T{match[3]}")
+            moment = datetime.fromisoformat(local + (match[7] or "Z").strip())
             return f"{moment.timestamp():.0f}.{match[5] or match[6] or 0}"
         return match[0]
 

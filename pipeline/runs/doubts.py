@@ -1,16 +1,18 @@
-"""Whether two images that were matched belong together, without calibration."""
+"""Two images of cameras of which nothing is known: their grey values, and whether they belong together."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.text.warning import warning
+from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity, has, matched, matched_back
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
+from rille.stages.imaging import levels
 
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
@@ -25,6 +27,13 @@ WHY_NOT = (
     (Validity.OVER_THRESHOLD, "look like nothing in the right image"),
     (Validity.SPECKLE, "lie in isolated patches"),
 )
+
+
+def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
+    """The images, their 16-bit samples spread where they use a small part of their range, and a warning of it."""
+    used = levels.levels_of(images)
+    said = [] if used is None else [warning("RIL-705", levels.words(used))]
+    return [levels.spread(image, used) for image in images], said
 
 
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:

@@ -755,6 +755,18 @@ def test_decimal_commas_are_called_so(tmp_path, text):
         read_cameras(written(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    "text", [PINHOLE, ORB, "P0: 707 0 601 0 0 707 183 0 0 0 1 0\nP1: 707 0 601 -380 0 707 183 0 0 0 1 0\n"]
+)
+def test_encodings_line_ends_and_remarks_do_not_matter(tmp_path, text):
+    known = [camera.lens for camera in read_cameras(written(tmp_path, text))]
+    head, remark = ("", "") if text.startswith("%") else ("# left and right\n", "# end\n")
+    for data in (text.encode("utf-16"), text.replace("\n", "\r").encode(), (head + text + remark).encode("utf-8-sig")):
+        path = tmp_path / "calibration.yaml"
+        path.write_bytes(data)
+        assert [camera.lens for camera in read_cameras(path)] == known
+
+
 def test_files_that_are_no_text(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
     with raises("RIL-140"):

@@ -123,6 +123,17 @@ def test_a_few_bytes_of_padding_before_the_end_are_no_damage(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_what_a_camera_writes_behind_a_jpeg_does_not_matter(tmp_path):
+    data = bytes(photograph())
+    known = files.decode(data, "x")
+    np.testing.assert_array_equal(files.decode(data + bytes(range(200)) * 100, "x"), known)  # a video
+    path = tmp_path / "DJI_0001.JPG"
+    image = Image.fromarray(known)
+    image.save(path, "MPO", save_all=True, append_images=[image.resize((32, 24))], quality=95)
+    assert files.common_header([path])[0] == Header(128, 96, 8)
+    assert np.abs(files.read_grey(path).astype(int) - known).mean() < 10
+
+
 def run(source):
     stage = files.image_stage
     bundle = stage.run(NoParams(), source.args | source.hints, {})

@@ -247,8 +247,8 @@ def test_a_value_beyond_any_sensor_is_refused_with_its_line(tmp_path, column, va
 @pytest.mark.parametrize(
     "names",
     [
-        "time,acc_x,acc_y,acc_z,wx,wy,wz",
-        "time,ax,ay,az,gyro_x,gyro_y,gyro_z",
+        "time,acc_x,acc_y,acc_z,gx,gy,gz",
+        "time,u,v,w,gyro_x,gyro_y,gyro_z",
         "time,ang_acc_x,ang_acc_y,ang_acc_z,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z",
     ],
 )
@@ -257,6 +257,32 @@ def test_no_column_is_taken_for_another_sensors(tmp_path, names):
     row = [9.81] * (len(names.split(",")) - 1)
     with raises("RIL-191", "only those of one sensor"):
         read_imu(record_file(tmp_path, names, [(0.0, *row), (0.1, *row)]))
+
+
+@pytest.mark.parametrize(
+    ("names", "scale"),
+    [
+        ("t,wx,wy,wz,ax,ay,az", 1),
+        ("t,gyro_x(dps),gyro_y(dps),gyro_z(dps),acc_x,acc_y,acc_z", np.pi / 180),
+        ("t,gyro_x [\N{DEGREE SIGN}/s],gyro_y [\N{DEGREE SIGN}/s],gyro_z [\N{DEGREE SIGN}/s],ax,ay,az", np.pi / 180),
+        (
+            "%time,"
+            + ",".join(f"field.{what}.{axis}" for what in ("angular_velocity", "linear_acceleration") for axis in "xyz")
+            + ",field.angular_velocity_covariance0",
+            1,
+        ),
+    ],
+)
+def test_names_and_units_as_loggers_write_them(tmp_path, names, scale):
+    path = tmp_path / "imu.csv"
+    more = ",9" if "covariance" in names else ""
+    path.write_text(
+        f"{names}\n0,0.1,0.2,0.3,0,0,9.8{more}\n1,,,,,,{more}\n2,0.1,0.2,0.3,0,0,9.8{more}\n", encoding="utf-8"
+    )
+    found = read_imu(path)
+    assert found.times.tolist() == [0, 2]
+    np.testing.assert_allclose(found.rates, np.tile([0.1 * scale, 0.2 * scale, 0.3 * scale], (2, 1)))
+    assert "1 row of 3" in found.warnings[0]
 
 
 def test_names_of_one_sensor_in_the_usual_order_are_enough(tmp_path):

@@ -140,11 +140,11 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
 
 def test_true_positions_that_cannot_be_read_are_told(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
-    write_lines(tmp_path / "truth.csv", ["time,x,y", "0,1,2", "1,nan,3"])
+    write_lines(tmp_path / "truth.csv", ["time,x,y", "0,1,2", "1,two,3"])
     found = inspect(tmp_path)
     assert not found.tables
     (line,) = found.unread
-    assert "truth.csv, line 3: 'nan'" in line
+    assert "truth.csv, line 3: 'two'" in line
 
 
 def test_what_is_recognised_and_refused_is_told(tmp_path):

@@ -275,6 +275,9 @@ def test_times_of_a_file_in_order_or_by_name(tmp_path):
         ["filename,timestamp", "left/02.png,11.0", "left/01.png,10.5", "left/00.png,10.0"][::-1],
         ["#frame;time [s];image name", *(f"{k};{10 + k / 2};C:\\x\\0{k}.jpg" for k in range(3))],
         ["index time", "0 10.0", "1 10.5", "2 11.0"],
+        ["0 10.0", "1 10.5", "2 11.0"],
+        ["0 left/00.png 10.0", "1 left/01.png 10.5", "2 left/02.png 11.0"],
+        ["1970-01-01 02:00:10+02:00", "1969-12-31T19:00:10.5-05:00", "1970-01-01 01:00:11 +0100"],
         ["1970-01-01 00:00:10.000000000", "1970-01-01T00:00:10.5Z", "19700101_000011"],
     ],
 )
@@ -282,6 +285,13 @@ def test_tables_of_times_of_other_programs(tmp_path, lines):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", lines)
     assert opened(path).times == (10.0, 10.5, 11.0)
+
+
+@pytest.mark.parametrize("lines", [["0.0 7", "1.0 8", "2.0 9"], ["0 a", "1 b", "2 c"]])
+def test_seconds_that_count_stay_times(tmp_path, lines):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", lines)
+    assert opened(path).times == (0.0, 1.0, 2.0)
 
 
 def test_a_table_of_other_images_is_refused(tmp_path):
@@ -659,6 +669,34 @@ sigma_deg = 0.5
     }
     assert priors["odometry"] == {"drift": 0.02, "turn": pytest.approx(math.radians(1.0))}
     assert priors["attitude"] == priors["up"] == {"sigma": pytest.approx(math.radians(0.5))}
+
+
+E = "431000,5411000,100"
+
+
+@pytest.mark.parametrize(
+    ("names", "rows", "left"),
+    [
+        ("time,x,y,z", [f"0,{E}", "0.5,nan,nan,nan", f"1,{E}"], (0, 1)),
+        ("time,x,y,z", ["0,,,", f"0.5,{E}", f"1,{E}"], (0.5, 1)),
+        ("tow,E,N,h", ["0,0,0,0", f"0.5,{E}", f"1,{E}"], (0.5, 1)),
+        ("time,x,y,z", ["0,0,0,0", "0.5,1,0,0", "1,2,0,0"], (0, 0.5, 1)),  # where the drive begins
+        ("time,x,y,z,quality", [f"0,{E},0", f"0.5,{E},4", f"1,{E},5"], (0.5, 1)),
+        ("time,x,y,z,q", [f"0,{E},0", f"0.5,{E},0", f"1,{E},0"], (0, 0.5, 1)),  # says nothing
+    ],
+)
+def test_positions_without_a_fix_are_left_out_and_counted(tmp_path, names, rows, left):
+    write_lines(tmp_path / "gnss.csv", [names, *rows])
+    s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n'))
+    assert tuple(s.priors["positions"]["times"]) == left
+    assert sum("RIL-706" in line for line in s.warnings) == (len(left) < 3)
+
+
+@pytest.mark.parametrize("more", ["", 'columns = { time = "time", x = "longitude", y = "latitude" }'])
+def test_degrees_are_no_metres(tmp_path, more):
+    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude", "0,48.1,11.5", "1,48.1,11.6"])
+    with raises("RIL-805", "UTM"):
+        opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'))
 
 
 def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):

@@ -50,6 +50,22 @@ def test_forms_of_one_pose(tmp_path, text, format):
     np.testing.assert_array_equal(found.poses[0].translation, [1, 2, 3])
 
 
+def test_poses_of_a_message_as_tools_of_ros_write_it(tmp_path):
+    names = [
+        f"field.pose.pose.{part}.{axis}" for part, of in (("position", "xyz"), ("orientation", "xyzw")) for axis in of
+    ]
+    text = f"%time,field.header.frame_id,{','.join(names)},field.twist.twist.linear.x\n1,odom,1,2,3,0,0,{H},{H},9\n"
+    found = read(tmp_path, text)
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-7)
+    np.testing.assert_array_equal(found.poses[0].translation, [1, 2, 3])
+
+
+def test_moments_in_which_a_tracker_has_lost_its_target_are_left_out(tmp_path):
+    found = read(tmp_path, "1 0 0 0 0 0 0 1\n2 nan nan nan nan nan nan nan\n3 0 0 0 0 0 0 0\n4 1 0 0 0 0 0 1\n")
+    assert found.times == (1.0, 4.0)
+    assert "2 rows of 4" in found.warnings[0]
+
+
 @pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)])
 def test_the_name_of_a_column_states_the_unit_of_its_times(tmp_path, name, factor):
     found = read(tmp_path, f"{name},qw,qx,qy,qz\n0,1,0,0,0\n100,1,0,0,0\n")

@@ -53,7 +53,7 @@ def test_sizes_lines_and_content_are_bounded(tmp_path):
     refused("RIL-139", read_lines, tmp_path / "sparse", "table")
     (tmp_path / "endless").symlink_to("/proc/self/maps")  # a regular file that says it has no bytes
     refused("RIL-754", read_bytes, tmp_path / "endless", "table", 10)
-    for name, data in (("binary", b"1 2\0 3"), ("latin", b"\xff\xfe")):
+    for name, data in (("binary", b"1 2\0 3"), ("latin", b"\xe9t\xe9"), ("odd", b"\xff\xfe1")):
         (tmp_path / name).write_bytes(data)
         refused("RIL-140", read_lines, tmp_path / name, "table")
     (tmp_path / "long").write_text("1\n" + "(" * (reading.LONGEST_LINE + 1))

@@ -90,6 +90,9 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
         open_sequence(str(tmp_path / "field.rille.txt"))
     with raises("RIL-276", "'no/such/folder'"):
         open_sequence("no/such/folder")
+    for name in ("a\0b", "x" * 5000, "\ud800", "x" * 5000 + ":1"):
+        with raises("RIL-276", "no sequence"):
+            open_sequence(name)
     with raises("RIL-276", "'~nobody-of-that-name/folder'"):
         open_sequence("~nobody-of-that-name/folder")
     with raises("RIL-276", "'nasa-k10'", "'nasa_k10'"):

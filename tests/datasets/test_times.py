@@ -88,6 +88,8 @@ def test_any_increasing_stamps_of_a_stated_unit(steps, start, unit):
         "2024-01-01T12:00:00Z",
         "2024/01/01 12:00:00 a",
         "img_20240101-120000",
+        "2024-01-01T14:00:00+02:00",
+        "2024-01-01 06:00:00.000 -0600",
     ],
 )
 def test_dates_become_seconds(text):

@@ -61,9 +61,26 @@ def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: An
 
 def test_match_refuses_grey_values_of_another_scale() -> None:
     right = np.random.default_rng(1).random((40, 60))
-    for other in (right, (right - 0.5) / 0.3, (255 * right).astype(">u2"), 65535 * right):
+    for other in (right, (right - 0.5) / 0.3, 65535 * right):
         with raises("RIL-973", "the right image"):
             rille.match(np.float32(255) * right, other)
+
+
+@pytest.mark.parametrize(("gain", "black", "kind"), [(1, 0, "<u2"), (1, 0, ">u2"), (4, 0, "<u2"), (1, 29000, "<u2")])
+def test_match_spreads_samples_of_16_bits_as_the_command_does(gain: int, black: int, kind: str) -> None:
+    import cv2
+
+    scene = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (60, 90)).astype(np.uint8), (0, 0), 1.5)
+    left, right = ((gain * image.astype(kind) + black).astype(kind) for image in (scene[:, 3:], scene[:, :-3]))
+    with pytest.warns(UserWarning, match="RIL-705"):
+        found = rille.match(left, right)
+    assert abs(float(found.column_disparity.median()) - 3) < 0.1
+
+
+@pytest.mark.parametrize("every", [0, -1, 1.5, None, "2", 10**30])
+def test_points_are_of_each_so_many_th_row(pair: rille.StereoPair, disparity: Any, every: Any) -> None:
+    with raises("RIL-867", "every"):
+        rille.points(disparity, pair, every)
 
 
 def test_match_takes_named_dimensions_in_either_order() -> None:

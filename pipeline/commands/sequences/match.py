@@ -14,15 +14,13 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from rille.datasets.images.files import read_grey, refuse_swapped
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
-from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts
+from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import matched
-from rille.stages.imaging import levels
 
 MIN_PIXELS_OF_BAR = 1_000_000
 """Pixels: above, matching takes seconds, and a bar on the terminal shows how far it is."""
@@ -119,11 +117,9 @@ def match(
     if confidence is not None:
         check_output(confidence, ".tif", ".tiff", option="--confidence", others=taken | {output.resolve(): "--output"})
     # Images and the prior are checked before the matcher is imported, which takes seconds.
-    images = read_grey(left), read_grey(right)
-    refuse_swapped(images, f"{left} and {right}")
-    used = levels.levels_of(images)
-    levelled = [] if used is None else [warning("RIL-705", levels.words(used))]
-    images = levels.spread(images[0], used), levels.spread(images[1], used)
+    stored = read_grey(left), read_grey(right)
+    refuse_swapped(stored, f"{left} and {right}")
+    images, spread = levelled(stored)
     prior = matcher.prior(images[0].shape)
 
     from rille.pipeline.flow import tiles
@@ -140,7 +136,7 @@ def match(
     write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
     if confidence is not None:
         write_confidence(confidence, result.disparity_std, result.validity, result.backmatch_error, tags)
-    for line in (*levelled, *doubts(result, *images)):
+    for line in (*spread, *doubts(result, *images)):
         warn(line)
     share = float(matched(result.validity).mean())
     typical = f", standard deviation {np.nanmedian(result.disparity_std):.2f} px (median)" if share else ""
