@@ -306,7 +306,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     from rille.stages.terrain.points import colours
     from rille.stages.terrain.points import points as points_of
 
-    if not isinstance(every, int | np.integer) or not 1 <= every < 2**31:
+    if not hasattr(every, "__index__") or not 1 <= every < 2**31:
         text = f"every = {every!r:.80} is no step from row to row"
         raise ConfigError("RIL-867", text, remedy="give a whole number, 1 for all rows and columns")
     given = _disparity(disparity, pair)

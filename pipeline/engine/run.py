@@ -495,10 +495,9 @@ class _Run:
                 else:
                     handle.reason = self.stopped
                     self._resolve(handle, "skipped")
-        lost = {h.index for h in self.graph.nodes if h.status in ("failed", "skipped")} & self.graph.outdated
-        labels = {h.label for h in self.graph.nodes if h.index in lost}
-        self.graph.nodes[:] = [h for h in self.graph.nodes if h.index not in lost]
-        self.result.failures = [f for f in self.result.failures if f.label not in labels]
+        gone = {h for h in self.graph.nodes if h.index in self.graph.outdated and h.status in ("failed", "skipped")}
+        self.graph.nodes[:] = [h for h in self.graph.nodes if h not in gone]
+        self.result.failures = [f for f in self.result.failures if f.label not in {h.label for h in gone}]
         for waiting in self.graph.expansions:
             missing = [h for h in waiting.handles if not h.done]
             self.result.unknown += [h.label for h in missing]
