@@ -45,6 +45,18 @@ def test_a_file_that_grows_counts_once_it_rests_and_decodes(tmp_path, ending):
     assert files.troubles() == []
 
 
+def test_linked_images_arrive_as_others(tmp_path):
+    path = write_sequence(tmp_path)
+    (tmp_path / "store").mkdir()
+    for side in ("left", "right"):
+        (path.parent / side).rename(tmp_path / "store" / side)
+        (path.parent / side).symlink_to(tmp_path / "store" / side)
+    files = Arrivals()
+    sequence = opened(path, files)
+    image = Path(sequence.image(0, "left").hints["path"])
+    assert files.first_seen(image) == files.first_seen(path.parent / "left" / image.name)
+
+
 def test_a_file_must_rest(tmp_path, monkeypatch):
     path, files = write_sequence(tmp_path).parent / "left/00.png", Arrivals()
     monkeypatch.setattr(arrivals, "SETTLE_SECONDS", 1000.0)

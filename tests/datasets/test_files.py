@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from io import BytesIO
 
 import cv2
@@ -196,3 +197,23 @@ def test_digests_are_remembered_until_the_file_changes(tmp_path, grey, monkeypat
     assert Digests(memory).sha256(path) != first
     memory.write_text("rubbish\n" + memory.read_text())
     assert Digests(memory).sha256(path) != first
+
+
+def test_a_file_that_is_written_anew_with_its_old_times_has_another_digest(tmp_path, grey):
+    path, digests = tmp_path / "a.pgm", Digests(tmp_path / "digests")
+    path.write_bytes(encoded(grey, ".pgm"))
+    before, status = digests.sha256(path), path.stat()
+    path.write_bytes(encoded(255 - grey, ".pgm"))
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert digests.sha256(path) != before
+
+
+def test_a_memo_that_cannot_be_written_is_left_out(tmp_path, grey):
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    path = folder / "a.png"
+    path.write_bytes(encoded(grey))
+    (tmp_path / "file").touch()
+    first = Digests(tmp_path / "file" / "digests").sha256(path)
+    for _ in range(2):
+        assert Digests(tmp_path / "digests").sha256(path) == first

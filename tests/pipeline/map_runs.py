@@ -88,6 +88,7 @@ def made_run(folder: Path, frame: Frame, place: Georeference | None = None, **mo
     world = {"definition": "made", "vertical": more.get("vertical", "attitude")}
     frames = [{"frame": 0, "name": "0", "time": 0.0}]
     facts = {
+        "units": {"time": "s"},
         "frames_of_reference": {"world": world},
         "frames": frames,
         "georeference": None if place is None else place.to_dict(),

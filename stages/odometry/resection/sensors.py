@@ -30,7 +30,7 @@ LEVER_SIGMA_M = 0.05
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
 MIN_STEP_SHARE = 0.05
-"""Of the median step: dead reckoning at rest is not exact."""
+"""Of the median step that is one: dead reckoning at rest is not exact."""
 VERTICAL_SIGMA = math.radians(5.0)
 """Of the world's vertical against that of the place: a plane of ground is a slope."""
 MIN_FIXES = 3
@@ -185,6 +185,8 @@ class RelativePrior:
         """Factors from each node to the next that has a pose by the sensor."""
         poses = self._at(own.rows, late)
         rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+        if self.drift and not np.diff(poses[rows, :, 3], axis=0).any():
+            rows = rows[:0]  # errors are shares of ways, and it has gone none
         a, b = rows[:-1], rows[1:]
         measured = motion(poses, a, b)
         way, count, clock = np.linalg.norm(measured[:, :, 3], axis=1), len(a), np.zeros((len(a), 6))
@@ -198,7 +200,7 @@ class RelativePrior:
         if not self.drift:
             sigma, shared = np.full((count, 3), self.turn), OFFSET_SIGMA_S * clock[:, :, None]
         else:
-            step = np.maximum(way, MIN_STEP_SHARE * np.median(way) if count else 0.0)[:, None]
+            step = np.maximum(way, MIN_STEP_SHARE * np.median(way[way > 0]) if count else 0.0)[:, None]
             sigma, used = np.repeat(step * [self.drift, self.turn], 3, axis=1), slice(0, 6)
             scale = np.concatenate([self.drift * measured[:, :, 3], np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -169,3 +170,13 @@ def test_places_that_cannot_be_written(drive, tmp_path):
         init(drive, output=tmp_path / "m.yaml")
     with raises("RIL-193"):
         init(tmp_path / "nothing")
+
+
+def test_a_name_with_line_breaks_becomes_no_key(drive):
+    folder = drive.rename(drive.with_name("x\n[vehicle]\nmax_slope_deg = 60\n#"))
+    (folder / "gnss.csv").write_text("time;x\n1,5;2\n")
+    (folder / "calibration.yaml").write_text(SETTINGS)
+    init(folder, output=Path("a.rille.toml"))
+    text = Path("a.rille.toml").read_text()
+    assert "# Not read:" in text
+    assert "vehicle" not in tomllib.loads(text)

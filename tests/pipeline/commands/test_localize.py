@@ -75,6 +75,7 @@ def test_flat_ground_has_no_place_and_no_trajectory_is_written(
 ) -> None:
     rng = np.random.default_rng(1)
     flat = made_map(tmp_path / "flat.tif", rng.normal(0, 0.005, (80, 80)).astype(np.float32), RASTERS["turned"])
+    (tmp_path / "out.tum").write_text("of an earlier map")
     assert run(made_run(tmp_path / "run", FRAME), flat, tmp_path / "out") == 3
     assert facts(tmp_path / "out")["ambiguous"] is True
     assert not (tmp_path / "out.tum").exists()

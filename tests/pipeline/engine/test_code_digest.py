@@ -17,7 +17,7 @@ FILES = {
     "near.py": "def half(x):\n    from .deep import inner\n    return inner.third(x) / 2\n",
     "deep/__init__.py": "",
     "deep/inner.py": "from ..sibling import LIMIT\ndef third(x):\n    return min(x / 3, LIMIT)\n",
-    "sibling.py": "LIMIT = 5\n",
+    "sibling.py": 'LIMIT = 5\n"""Greatest value."""\n',
     "typed.py": "X = 1\n",
     "stranger.py": "Y = 1\n",
 }
@@ -64,6 +64,7 @@ def test_reaches_helpers_at_any_depth_and_no_strangers(package):
         ("main.py", "return half(x)", "return (  half( x ) )"),
         ("__init__.py", '"""Package."""', '"""Other."""'),
         ("sibling.py", "5", "5  # metres"),
+        ("sibling.py", "Greatest", "Largest"),
         ("stranger.py", "1", "2"),
         ("main.py", "", "\nfrom typing import TYPE_CHECKING\n"),
     ],

@@ -7,10 +7,14 @@ from toys import mischief, numbers, scale, total
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
+from rille.pipeline.engine import events
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph, Maybe, MissingError
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.runs.run_files import task_rows
 from rille.stages.core.declare import NoParams
+from rille.stages.core.errors import DegenerateError
 
 NO = NoParams()
 
@@ -110,3 +114,47 @@ def test_a_stage_may_be_named_by_its_module(tmp_path):
     assert a.spec.module == b.spec.module
     assert run(graph, tmp_path).ok
     assert a.key == b.key
+
+
+def outdated(graph):
+    """Two tasks of a calibration that is then corrected: one of them cannot be computed, one is the same task again."""
+    number(graph, 0), number(graph, 1), broken(graph)
+    graph.outdated |= {0, 1, 2}
+    number(graph, 0)
+    graph.node(numbers.STAGE, "numbers/1", NumbersParams(size=9), {"frame": 1})
+    graph.node(mischief.STAGE, "broken/degenerate", NO, {"what": "fine"})
+
+
+def test_what_failed_with_an_outdated_calibration_is_of_no_account(tmp_path):
+    graph = Graph()
+    outdated(graph)
+    result = run(graph, tmp_path, ledger=tmp_path / "ledger.jsonl")
+    assert result.ok
+    assert result.counts == {"computed": 4}
+    assert events.facts(tmp_path / "ledger.jsonl")["outdated"] == ["numbers/1"]
+
+
+def test_an_exporter_opens_what_was_laid_out_last(tmp_path):
+    graph, store = Graph(), Store(tmp_path / "cache")
+    outdated(graph)
+    run(graph, tmp_path, ledger=tmp_path / "ledger.jsonl")
+    found = RunArtifacts(tmp_path, store)
+    assert [len(found.one(f"numbers/{k}")["values"]) for k in (0, 1)] == [8, 9]
+    assert sorted(found.all("numbers")) == ["0", "1"]
+
+
+def test_a_flow_that_raises_has_a_line_in_the_ledger(tmp_path):
+    graph = Graph()
+
+    def flow():
+        yield number(graph, 0)
+        raise DegenerateError("RIL-051", "no elevation model has a cell in the world")
+
+    graph.flow(flow())
+    result = run(graph, tmp_path, ledger=tmp_path / "ledger.jsonl")
+    assert not result.ok
+    (line,) = (row for row in events.read(tmp_path / "ledger.jsonl") if row["status"] == "failed")
+    assert line["label"] == "plan after numbers/0"
+    assert "no elevation model has a cell" in line["reason"]
+    (row,) = (row for row in task_rows(graph, result.failures) if row.status == "failed")
+    assert row.reason == "no elevation model has a cell in the world"

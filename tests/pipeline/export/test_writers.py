@@ -175,7 +175,17 @@ def test_times_since_1970_keep_their_microseconds(tmp_path: Path) -> None:
     write_table(tmp_path / "a.csv", {"time_s": [1403636579.763555, 1403636579.813555, 0.1 + 0.2]})
     rows = [row["time_s"] for row in csv.DictReader((tmp_path / "a.csv").open())]
     assert rows[2] == "0.3"
+    write_table(tmp_path / "b.csv", {"time_s": [99999.999999]})
+    assert "99999.999999" in (tmp_path / "b.csv").read_text()
     np.testing.assert_allclose(np.array(rows[:2], float) - 1403636579, [0.763555, 0.813555], atol=1e-5)
+
+
+def test_a_trajectory_keeps_all_digits_of_its_times(tmp_path: Path) -> None:
+    times = [1305031102.175304, 1403636579.7635555]
+    write_trajectory_tum(tmp_path / "a.tum", np.tile(np.eye(3, 4), (2, 1, 1)), times)
+    rows = [line.split() for line in (tmp_path / "a.tum").read_text().splitlines()[1:]]
+    assert [float(row[0]) for row in rows] == times
+    assert rows[0] == ["1305031102.175304", *["0", "0", "0", "0", "0", "0", "1"]]
 
 
 def test_only_what_was_written_is_described() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from raising import raises
 from toys import chain
@@ -38,3 +40,12 @@ def test_runs_are_found_by_the_names_that_users_type(tmp_path, linked):
     assert {text: lookup.find(text, tmp_path / "runs") for text in known} == {t: every[k] for t, k in known.items()}
     with raises("RIL-067", "20260103"):
         lookup.find("20260104", tmp_path / "runs")
+
+
+def test_a_run_has_one_path_however_it_is_named(tmp_path, monkeypatch):
+    run = tmp_path / "runs/a/20260103"
+    run.mkdir(parents=True)
+    (run / lookup.LEDGER).touch()
+    (tmp_path / "runs/a/latest").symlink_to("20260103")
+    monkeypatch.chdir(tmp_path)
+    assert {lookup.find(text, Path("runs")) for text in ("latest", "a", "20260103", "a/20260103")} == {run}

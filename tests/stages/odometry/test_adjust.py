@@ -258,3 +258,14 @@ def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames
     ]
     # Half a round of 5 m lies 10 m away.
     assert shares == pytest.approx([0.1, 0.1], rel=0.15)
+
+
+def test_links_that_contradict_each_other_join_no_pieces():
+    truth, rng = ring(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng, lost={6})
+    one, other = seen(truth, 0, 11, rng), seen(truth, 1, 10, rng)
+    other["pose"][3] += 0.25
+    out = adjusted(segments, before, one, other)
+    posed = np.isfinite(out["poses"]).all((1, 2))
+    sigma = np.sqrt(np.einsum("fii->fi", out["covariance"][posed]))
+    assert sigma.max() < 1.0

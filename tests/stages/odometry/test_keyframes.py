@@ -194,3 +194,12 @@ def test_a_stride_given_alone_sets_the_rule():
     assert KeyframesParams().rule == "overlap"
     assert KeyframesParams(stride=3).rule == "stride"
     assert KeyframesParams.model_validate({"stride": 3, "rule": "overlap"}).rule == "overlap"
+
+
+def test_frames_that_may_not_be_basic_are_the_cause_of_little_overlap():
+    steps = {"steps": tables([motion(shift(40.0))] * 9)}
+    given = {"frames": 10, "unfit": [1, 2, 3, 4, 5, 6, 7]}
+    meta = keyframes.keyframes_stage.run(KeyframesParams(), given, steps).meta
+    assert meta["basic"] == [0, 8]
+    (line,) = meta["warnings"]
+    assert "between positions 0 and 8 may not be basic pairs" in line

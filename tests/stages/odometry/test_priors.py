@@ -182,3 +182,50 @@ def test_the_vertical_holds_a_chain_upright():
     out = adjusted(segments, before, {**BASE, "up": {"directions": up, "sigma": 0.002}})
     tilt = [np.linalg.norm(errors(one, truth)[:, 3:5], axis=1).max() for one in (before, out)]
     assert tilt[1] < 0.7 * tilt[0]
+
+
+@pytest.mark.parametrize(
+    "link", [lambda truth, rng: {}, lambda truth, rng: odometry(truth, rng, scale=1.06)], ids=["attitude", "refused"]
+)
+def test_an_attitude_joins_no_pieces(link):
+    """Nor does it hold together what odometry had joined, which then turns out to contradict the camera."""
+    truth, rng = winding(), np.random.default_rng(5)
+    segments, before = run_of(truth, rng, lost=set(range(12, 19)))
+    attitude = {"rotations": [T.rotation.tolist() for T in truth], "sigma": 0.003}
+    out = adjusted(segments, before, {**BASE, **link(truth, rng), "attitude": attitude})
+    assert out.meta["pieces"] == before.meta["pieces"]
+    posed = np.isfinite(out["poses"]).all((1, 2))
+    assert np.isfinite(out["covariance"][posed]).all()
+    # A degree and a half; without another sensor positions keep their errors.
+    assert np.nanmax(np.linalg.norm(errors(out, truth)[:12, 3:], axis=1)) < 0.025
+
+
+def test_positions_of_one_moment_lay_no_piece():
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    near = gnss(truth, rng)
+    near["positions"] |= {"times": [1.99, 2.0, 2.01], "positions": [near["positions"]["positions"][20]] * 3}
+    (line,) = (line for line in adjusted(segments, before, near).meta["warnings"] if line.startswith("["))
+    assert "is not used: no piece" in line
+
+
+def test_wheels_at_rest_agree_with_a_camera_at_rest():
+    rng = np.random.default_rng(7)
+    ahead = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    truth = [RigidTransform(ahead, 2e-4 * rng.standard_normal(3)) for _ in TIMES]
+    segments, before = run_of(truth, rng)
+    still = {**BASE, "odometry": {"poses": [np.eye(3, 4).tolist()] * len(TIMES), "drift": 0.02, "turn": 0.005}}
+    assert not [line for line in adjusted(segments, before, still).meta["warnings"] if "contradicts" in line]
+
+
+def test_a_later_piece_does_not_say_where_the_world_lies():
+    truth, rng = winding(), np.random.default_rng(8)
+    segments, before = run_of(truth, rng, lost=set(range(12, 19)))
+    given, wheels = gnss(truth, rng), odometry(truth, rng)["odometry"]
+    given["positions"] |= {key: given["positions"][key][:12] for key in ("positions", "times")}
+    # Dead reckoning that begins behind the gap joins nothing, and says nothing of the first piece.
+    wheels["poses"] = [None] * 19 + wheels["poses"][19:]
+    alone = adjusted(segments, before, given).meta
+    both = adjusted(segments, before, {**given, "odometry": wheels}).meta
+    assert both["pieces"] == before.meta["pieces"]
+    assert both["priors"]["place"] == alone["priors"]["place"]

@@ -215,3 +215,12 @@ def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none()
     assert blind.meta["verticals"] == ["none"]
     assert "frames 0-4" in blind.meta["warnings"][0]
     np.testing.assert_array_equal(np.asarray(blind["poses"])[0], unlevelled.matrix34)
+
+
+def test_one_pair_behind_a_lost_frame_has_the_pose():
+    T = level(np.random.default_rng(8))
+    inputs = {"segments": [], "levels": [Bundle({}, {"T_local_left": T.to_list(), "source": "attitude"})]}
+    given = {"frames": [4, 5], "lost": [{"frame": 4, "cause": "black left image"}]}
+    found = trajectory_stage.run(NoParams(), given, inputs)
+    assert np.isfinite(found["poses"]).all((1, 2)).tolist() == [False, True]
+    assert [(one["frame"], one["cause"]) for one in found.meta["lost"]] == [(4, "black left image")]

@@ -462,3 +462,16 @@ def test_the_cell_nearest_to_the_middle_of_a_row_is_the_first_of_the_nearest(see
     cells[rng.integers(rows), rng.integers(cols)] = True
     listed = [(int(r), int(c)) for r, c in np.argwhere(cells)]
     assert nearest_middle(cells, row) == min(listed, key=lambda at: abs(at[0] - row) + abs(at[1] - 0.5 * (cols - 1)))
+
+
+@pytest.mark.parametrize("planner", ["rows", "auto"])
+def test_a_target_in_a_closed_ring_is_said_not_to_be_connected(planner: str) -> None:
+    lattice = Lattice.at(-60, 120, CELL, 121, 121)
+    risk, z = level(lattice)
+    risk[45:80, 45:80] = HAZARDOUS
+    risk[50:75, 50:75] = risk[0, 0]
+    ends = ((0.0, 0.1), (0.02, 0.58))
+    route = find_path(maps(risk, z), lattice, SHORT, ends=ends, params=PathParams(planner=planner))
+    assert not len(route.cells)
+    assert route.reason == "start and target are not connected by ground that the vehicle may cross"
+    assert route.blocking_row is None

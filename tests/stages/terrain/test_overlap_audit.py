@@ -110,3 +110,11 @@ def test_of_a_large_overlap_some_cells_tell_as_much() -> None:
 @pytest.mark.parametrize(("systematic", "noise", "expected"), [(2.1, 1.0, True), (1.9, 0.1, False), (2.1, 1.1, False)])
 def test_a_seam_stands_out_beyond_sigma_and_noise(systematic: float, noise: float, expected: bool) -> None:
     assert stands_out({"systematic": systematic, "expected": 1.0, "noise": noise}, 2.0) is expected
+
+
+def test_a_cell_without_a_grey_value_does_not_hide_the_exposure() -> None:
+    dems = along(3, grey={4: 130.0})
+    dems[4]["ortho"][20, 20] = np.nan
+    seams, _ = audited(dems)
+    ratios = [s["log_ratio"] for b in seams for s in b.meta["seams"] if s["pair"] == 4]
+    assert ratios == [pytest.approx(math.log(1.3), abs=0.005)]

@@ -89,6 +89,8 @@ def test_laspy_reads_every_matched_pixel(tmp_path: Path, place: Georeference | N
     assert words == f"{len(pair)} points of 2 pairs, 1 without a pose are left out"
     las = laspy.read(path)
     assert las.header.are_points_compressed
+    written(Recorded(tmp_path / "run", place), path.with_name("A.LAZ"))
+    assert path.with_name("A.LAZ").read_bytes() == path.read_bytes()
     where = position if place is None else place.apply(position)
     # The disparity is stored with 24 bits.
     np.testing.assert_allclose(las.xyz, where, atol=las.header.scales[0] + 1e-6)
