@@ -130,7 +130,7 @@ def match(
     shapes = images[0].shape, images[1].shape
     with _progress(max(image.size for image in images)) as tell:
         how = tiles.how(tiles.Tiling(), params, PyramidParams(), shapes, tell)
-        result = hfvm.match(*images, params, prior=prior, how=how)
+        result = hfvm.match(images[0], images[1], params, prior=prior, how=how)
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
     column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}
