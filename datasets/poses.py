@@ -142,10 +142,9 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
-    degrees = any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header)
     if not columns and (_whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
         return None
-    if len(known) < 2 or degrees:
+    if len(known) < 2 or any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header):
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
