@@ -56,8 +56,6 @@ GYROSCOPE = re.compile(r"(.*[./])?(gyr|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
 """How names of columns begin, behind the path of a field of a message of ROS."""
 
-DEGREES = re.compile(r"deg|dps|\N{DEGREE SIGN}")
-
 ORDER = ([1, 2, 3], [4, 5, 6])
 """Columns of rates and forces where no names tell."""
 
@@ -117,7 +115,7 @@ def read_imu(path: Path) -> ImuRecord:
     table, warnings = table.measured([0, *gyro, *accelerometer])
     times = times_of(table, 0)
     rates, forces = table.numbers(gyro), table.numbers(accelerometer)
-    if any(DEGREES.search(table.header[k]) for k in gyro if table.header):
+    if any(re.search("deg|dps|\N{DEGREE SIGN}", table.header[k]) for k in gyro if table.header):
         rates = np.deg2rad(rates)
     # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
     _possible(rates, 200.0, "rad/s", table)

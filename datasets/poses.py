@@ -41,14 +41,12 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
 WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
-PATH = r"(?:.*[./])?"
-"""Of a field of a message of ROS, as tools write it before its name."""
-
 WORDS = (
     (re.compile(r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow"), lambda m: "time"),
-    (re.compile(rf"{PATH}(?:q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[1]),
+    # Tools of ROS write the path of a field before its name.
+    (re.compile(r"(.*[./])?(q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
-    (re.compile(rf"{PATH}(?:position|translation)[./]([xyz])"), lambda m: m[1]),
+    (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
@@ -56,8 +54,8 @@ WORDS = (
 )
 
 
+# Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one.
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
-"""Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one."""
 
 DEGREES = re.compile(r"\b(lat|lon)")
 
@@ -144,10 +142,9 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
-    degrees = any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header)
     if not columns and (_whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
         return None
-    if len(known) < 2 or degrees:
+    if len(known) < 2 or any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header):
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
@@ -167,12 +164,10 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
     """Whether a receiver had no position in a row: its quality is 0, or x and y are, a kilometre from all others."""
     away = np.hypot(*table.values([x, y]).T)
+    quality = table.values([k for k, name in enumerate(table.header) if FIX.fullmatch(name)])
+    none = ((quality == 0) & (quality > 0).any(axis=0)).any(axis=1)
     # m; no vehicle jumps so far
-    missing: AnyArray = (away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)
-    for k in [k for k, name in enumerate(table.header) if FIX.fullmatch(name)]:
-        quality = table.values([k])[:, 0]
-        missing |= (quality == 0) & bool((quality > 0).any())
-    return missing
+    return np.asarray(none | ((away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)))
 
 
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:

@@ -229,7 +229,6 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     built: Any = config.build(carried, {"hfvm": hfvm})
     left, right = map(_rows_first, (left, right))
     images = [np.asarray(image) for image in (left, right)]
-    images = [image.astype(image.dtype.newbyteorder("="), copy=False) for image in images]
     for camera, image in zip(("left", "right"), images, strict=True):
         if image.dtype.kind in "OSU":  # a path, or nothing
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
@@ -240,9 +239,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
             if 0 < high <= 1 or (low < 0 and high - low < 16) or high > 2 * 255:
                 text = f"the {camera} image's values lie from {low:.3g} to {high:.3g}: {image.dtype} is taken as 0..255"
                 raise InputError("RIL-973", text, remedy="scale them to 0..255")
-    spread = list[str]()
-    if "valid" not in getattr(left, "coords", ()):  # images of a sequence are spread as its others
-        images, spread = levelled(images)
+    # Images of a sequence are spread as its others are.
+    images, spread = (images, list[str]()) if "valid" in getattr(left, "coords", ()) else levelled(images)
     valid = [_valid(image) for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
@@ -306,11 +304,10 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     from rille.stages.terrain.points import colours
     from rille.stages.terrain.points import points as points_of
 
-    if not hasattr(every, "__index__") or not 1 <= every < 2**31:
-        text = f"every = {every!r:.80} is no step from row to row"
-        raise ConfigError("RIL-867", text, remedy="give a whole number, 1 for all rows and columns")
+    if every not in range(1, 100_000):
+        raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
     given = _disparity(disparity, pair)
-    found = points_of(given, pair.sequence.rig, every)
+    found = points_of(given, pair.sequence.rig, int(every))
     left: Bundle = Bundle({"image": np.asarray(pair.left)}, {})
     return xarray.Dataset(
         {

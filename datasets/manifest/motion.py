@@ -142,8 +142,7 @@ class MotionReader:
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
-            places = [by_name.get(pair.left.stem) for pair in self.pairs]
-            return [None if k is None else rows[k] for k in places]
+            return [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
         rows = list(self.arrived(rows))
         if images or len(rows) not in self.counts():
             more = f", none of {absent}" if by_name else ""
@@ -302,7 +301,6 @@ def _counts(rows: Sequence[Sequence[str]]) -> bool:
     cells = [row[:2] for row in rows if len(row) > 1 and NUMBER.match(row[0]) and NUMBER.match(row[1])]
     if len(cells) < max(2, len(rows)):
         return False
-    number, time = np.array(cells, dtype=float).T
-    steps = np.diff(time)
-    counted = number[0] in (0, 1) and (np.diff(number) == 1).all() and (steps > 0).all()
-    return bool(counted and (time[0] > 1e8 or (steps != 1).any()))
+    steps = np.diff(np.array(cells, dtype=float), axis=0)
+    counted = float(cells[0][0]) in (0, 1) and (steps[:, 0] == 1).all() and (steps[:, 1] > 0).all()
+    return bool(counted and (float(cells[0][1]) > 1e8 or (steps[:, 1] != 1).any()))

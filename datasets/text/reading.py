@@ -56,6 +56,7 @@ POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
 """How files begin that Git LFS and git-annex left in place of their content."""
 
 WILD = re.compile(r"[*?\[]")
+HIDDEN = re.compile(r"\.(?!\d+\.)")  # .25.png is a number
 
 
 def open_regular(path: Path, what: str, most: int) -> BufferedReader:
@@ -248,7 +249,7 @@ class Search:
         for _ in range(depth + 1):
             inner = []
             for folder in level:
-                entries = [e for e in self.entries(folder) if hidden or not e.name.startswith(".")]
+                entries = [e for e in self.entries(folder) if hidden or not HIDDEN.match(e.name)]
                 yield folder, entries
                 inner += [Path(e.path) for e in entries if e.is_dir(follow_symlinks=links)]
             places = {os.path.realpath(path): path for path in reversed(inner)}
@@ -283,7 +284,7 @@ class Search:
 
     def _named(self, folder: Path, pattern: str) -> list[Path]:
         """What a pattern names, of hidden ones (as macOS adds to archives) nothing unless it begins with a dot."""
-        entries = (e for e in self.entries(folder) if pattern.startswith(".") or not e.name.startswith("."))
+        entries = (e for e in self.entries(folder) if pattern.startswith(".") or not HIDDEN.match(e.name))
         return [Path(e.path) for e in entries if fnmatch.fnmatchcase(_folded(e.name), _folded(pattern))]
 
 

@@ -25,10 +25,6 @@ from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
-Lines = tuple[str, ...]
-COMMENTS = ("#", "%", "//")
-NOTHING = ("", "-", "na", "n/a", "null", "none")
-"""In a cell of what was not measured, beside NaN."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +50,7 @@ class TextTable:
         """Columns as numbers (rows, columns); NaN where nothing was measured, infinity where there is no number."""
         return np.array([[_number(row[column]) for column in columns] for row in self.rows])
 
-    def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, Lines]:
+    def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, tuple[str, ...]]:
         """The table without rows that say nothing in a column, or are ``lost``, and a warning that counts them.
 
         Where no row is left, all are: whoever reads them says what is wrong.
@@ -65,8 +61,8 @@ class TextTable:
         kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
         rows, lines = zip(*kept, strict=True)
         text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement left out"
-        first = self.lines[int(missing.argmax())]
-        return replace(self, rows=rows, lines=lines), (warning("RIL-706", f"{text}, the first in line {first}"),)
+        text += f", the first in line {self.lines[int(missing.argmax())]}"
+        return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
     def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
         """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` rows may be NaN as a whole.
@@ -89,7 +85,7 @@ class TextTable:
 def _number(cell: str) -> float:
     """Number of a cell; NaN of one that says nothing, infinity of any other text."""
     try:
-        return math.nan if cell.lower() in NOTHING else float(cell)
+        return math.nan if cell.lower() in ("", "-", "na", "n/a", "null", "none") else float(cell)
     except ValueError:
         return math.inf
 
@@ -113,7 +109,7 @@ def read_table(path: Path, what: str) -> TextTable:
     for k, line in enumerate(lines, start=1):
         # Tabs at the end may part cells that are empty.
         text = (undated(line) if DATE.match(line) else line).lstrip().rstrip(" ")
-        if not text or (rows and text.startswith(COMMENTS)):
+        if not text or (rows and text.startswith(("#", "%", "//"))):
             continue
         if not rows:
             # Set anew by every line up to the first row, which decides: a comment above it may hold a comma.

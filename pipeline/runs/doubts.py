@@ -32,8 +32,7 @@ WHY_NOT = (
 def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
     """The images, their 16-bit samples spread where they use a small part of their range, and a warning of it."""
     used = levels.levels_of(images)
-    said = [] if used is None else [warning("RIL-705", levels.words(used))]
-    return [levels.spread(image, used) for image in images], said
+    return [levels.spread(i, used) for i in images], [] if used is None else [warning("RIL-705", levels.words(used))]
 
 
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:

@@ -59,7 +59,7 @@ class Lattice:
             raise ConfigError(
                 "RIL-356",
                 f"{self.rows} x {self.cols} cells of {self.cell:g} m are more than {MAX_CELLS}",
-                remedy=f"set locus.cell_size to {enough:.2g} m or more, or narrow locus.extent",
+                remedy=f"set locus.cell_size to {enough:.2g} m or more, narrow locus.extent, or drive to a nearer goal",
             )
         for name, value in (("x0", self.x0), ("y0", self.y0)):
             index = value / self.cell

@@ -28,7 +28,7 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
 
     The gain is a power of two that leaves the samples of these images half of the range, for others may be brighter.
     """
-    deep = [image for image in images if image.dtype == np.uint16 and _shows(image)]
+    deep = [image for image in images if np.issubdtype(image.dtype, np.uint16) and _shows(image)]
     if not deep:
         return None
     dark, bright = (int(f(np.percentile(image, q) for image in deep)) for f, q in ((min, 0.5), (max, 99.5)))
@@ -42,7 +42,7 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
 
 def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
     """A uint16 image with its samples spread; any other one as it is."""
-    if levels is None or image.dtype != np.uint16:
+    if levels is None or not np.issubdtype(image.dtype, np.uint16):
         return image
     black, gain = levels
     return np.clip((image.astype(np.int64) - black) * gain, 0, WHITE).astype(np.uint16)

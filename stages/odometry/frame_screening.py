@@ -198,7 +198,7 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
     """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
     if not changes:
         return []
-    limit = max(params.jump, params.jump * float(np.quantile(changes, QUIET)))
+    limit = max(params.jump, params.jump * float(np.quantile(changes, QUIET, method="lower")))
     found = {n for k, value in enumerate(changes) if value > limit for n in frames[k : k + 3]}
     return [f for f in frames if f in found]
 

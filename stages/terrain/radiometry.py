@@ -23,6 +23,9 @@ from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 
 LOG_GAIN_STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
+SWAY_SHARE = 1e-3
+"""Of all squared steps of the models: a direction with less tells no gradient. With a hundredth a chain of ten models of
+one exposure got a slope of a fifth from end to end, and random exposures were left half."""
 FADING_WEIGHT = 0.05
 """Weight of the second term: a lasting change fades by 1/e over sqrt(1 / FADING_WEIGHT) = 4.5 models of a chain."""
 
@@ -50,7 +53,7 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
     wanted = -np.array([ratio for _, _, ratio in ordered])
     # A direction in which the cameras hardly move tells no gradient: sway is not the way.
-    small = 0.01 * max(float((moved**2).sum()), 1e-9)
+    small = SWAY_SHARE * max(float((moved**2).sum()), 1e-9)
     ridge = diags_array(np.array([FADING_WEIGHT] * n + [small] * 2))
     solved = spsolve((design.T @ design + ridge).tocsc(), design.T @ wanted)[:n]
     # Beyond a factor of 2 it is not exposure.

@@ -90,7 +90,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, grey):
     with raises("RIL-170"):
         files.decode(bytes(data), "x")
     jpeg = encoded(grey, ".jpg")
-    with raises("RIL-170"):
+    with raises("RIL-763"):
         files.decode(jpeg[: len(jpeg) // 2], "x")
     with raises("RIL-171"):
         files.decode(b"not an image at all", "x")

@@ -323,6 +323,19 @@ def test_dates_in_names_are_times_and_counts_are_not(tmp_path):
     assert opened(path).times == (0.0, 1.0, 2.0)
 
 
+def test_numbers_without_a_leading_zero_are_no_hidden_files(tmp_path):
+    path = write_sequence(tmp_path, frames=4)
+    for side in ("left", "right"):
+        for k, name in enumerate((".75", ".5", "1.25", ".tmp")):
+            (tmp_path / side / f"{k:02d}.png").rename(tmp_path / side / f"{name}.png")
+    assert [opened(path).image(k, "left").hints["path"].rpartition("/")[2] for k in range(3)] == [
+        ".5.png",
+        ".75.png",
+        "1.25.png",
+    ]
+    assert opened(path).frames == 3
+
+
 def test_times_of_names(tmp_path):
     names = [f"{side}/{1_500_000_000 + k}.5.png" for k in range(3) for side in ("left", "right")]
     path = write_sequence(tmp_path, "[times]\nnames = true\n", frames=0)

@@ -184,6 +184,12 @@ def test_settings_come_back_from_their_assignments(value: object) -> None:
     assert configuration.parse_assignments(words) == {"section": {"key": value}}
 
 
+def test_one_sequence_may_stand_for_a_list_of_one() -> None:
+    for one in ("no-such-sequence", Path("no/such/folder")):
+        (error,) = rille.reconstruct_many(one)
+        assert isinstance(error, rille.RilleError)
+
+
 def test_its_examples_run() -> None:
     found = doctest.testmod(api)
     assert found.attempted >= 4

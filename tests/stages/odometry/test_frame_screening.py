@@ -124,12 +124,21 @@ def test_frames_whose_left_image_is_of_another_time_are_lost_beside_frames_that_
     assert not found({}, jumps=[3], sides=dict.fromkeys((2, 3, 4), apart)).lost
 
 
+def test_one_exchanged_frame_stands_out_among_six():
+    frames = list(range(6))
+    qualities = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
+    motions = [motion(shift(columns)) for columns in (9.0, 9.0, -40.0, 58.0, 9.0)]
+    inputs = {"qualities": qualities, "steps": tables(motions), "bridges": [], "sides": []}
+    assert 3 in frame_screening_stage.run(PARAMS, {"frames": frames}, inputs).meta["asks"]["sides"]
+
+
 def test_the_stage_asks_then_answers():
     frames = list(range(5))
     blind = motion(shift(0.0), unmatched=lambda x, y: x > 20)
     motions = [motion(shift(9.0)), blind, blind, motion(shift(9.0))]
     qualities = [Bundle({}, {"frame": k} | sight(k)) for k in frames]
-    inputs = {"qualities": qualities, "steps": tables(motions), "bridges": [], "sides": []}
+    sides = [Bundle({}, {"frame": k, "swapped": False, "as_given": 0.9, "exchanged": 0.0}) for k in frames]
+    inputs = {"qualities": qualities, "steps": tables(motions), "bridges": [], "sides": sides}
     first = frame_screening_stage.run(PARAMS, {"frames": frames}, inputs)
     check_outputs(frame_screening_stage, first)
     assert first.meta["asks"]["bridges"] == [[1, 3]]
