@@ -24,8 +24,8 @@ from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 LOG_GAIN_STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
 SWAY_SHARE = 1e-3
-"""Of all squared steps of the models: a direction with less tells no gradient. With a hundredth a chain of ten models of
-one exposure got a slope of a fifth from end to end, and random exposures were left half."""
+"""Of all squared steps of the models: a direction with less tells no gradient. With a hundredth a chain of ten models
+of one exposure got a slope of a fifth from end to end, and random exposures were left half."""
 FADING_WEIGHT = 0.05
 """Weight of the second term: a lasting change fades by 1/e over sqrt(1 / FADING_WEIGHT) = 4.5 models of a chain."""
 
