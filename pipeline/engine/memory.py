@@ -24,10 +24,6 @@ WORKER_BYTES = 250e6
 """Memory of a worker process between tasks: Python with NumPy, SciPy and numba."""
 
 
-class MemoryRefusedError(ConfigError):
-    """A task needs more memory than the limit, all others aside."""
-
-
 def parse(text: str) -> int:
     """Bytes of ``6GB``, ``800 MiB``, ``75%`` (of the machine or its control group).
 
@@ -94,13 +90,13 @@ class Budget:
         """Number of workers each of which may run the ``largest`` task [bytes] at once."""
         return int(max(1, min(self.jobs, (self.limit - self.own) // (WORKER_BYTES + largest))))
 
-    def refusal(self, handle: Handle, estimate: float) -> MemoryRefusedError | None:
+    def refusal(self, handle: Handle, estimate: float) -> ConfigError | None:
         """Why a task cannot run here at all, if so."""
         if estimate <= self.alone:
             return None
         lower = handle.spec.stage.memory.lower
         change = f"change {' or '.join(lower)}, or " if lower else ""
-        return MemoryRefusedError(
+        return ConfigError(
             "RIL-500",
             f"is estimated to need {words(estimate)}, and {words(self.alone)} are left for a task of the limit of "
             f"{words(self.limit)} (the program itself and a worker hold {words(self.own + WORKER_BYTES)})",

@@ -36,16 +36,12 @@ NAMED = (
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 
 
-class MissingPackageError(RilleError):
-    """A package that a stage imports, or what was asked for needs, is not installed."""
-
-
 def versions(module: str) -> dict[str, str]:
     """Version and kind of each distribution that a module and what it reaches import, by the distribution's name.
 
     Raises
     ------
-    MissingPackageError
+    RilleError
         One of them is not installed.
     """
     # Without what checks parameters, whose values are in the key, the engine, whose format is, and types
@@ -76,7 +72,7 @@ def _version(name: str) -> tuple[str, str]:
             return distribution, version(distribution)
     for distribution in _distributions().get(name, []):
         return distribution, version(distribution)
-    raise MissingPackageError("RIL-530", f"package {name} is not installed", remedy="run `make install`")
+    raise RilleError("RIL-530", f"package {name} is not installed", remedy="run `make install`")
 
 
 _distributions = cache(importlib.metadata.packages_distributions)

@@ -54,10 +54,6 @@ ROOM = 2000
 process, and so few that dask's scheduler stays small."""
 
 
-class TaskError(RilleError):
-    """A task failed; its own error is the cause (``__cause__``)."""
-
-
 class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
 
@@ -104,7 +100,7 @@ class Result:
             if (known := translated(error)) is not None:
                 raise known.at(first.label) from error
             text = f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
-            raise TaskError("RIL-534", text) from error
+            raise RilleError("RIL-534", text) from error
 
 
 def is_hole(error: BaseException) -> bool:
@@ -150,7 +146,7 @@ def run(graph: Graph, store: Store, options: RunOptions = _DEFAULTS) -> Result:
 
     Raises
     ------
-    MemoryRefusedError
+    ConfigError
         A task that is known beforehand does not fit, even alone.
     KeyboardInterrupt
         Interrupted; running tasks are killed, committed artifacts stay.
@@ -333,7 +329,7 @@ class _Run:
 
         Raises
         ------
-        MemoryRefusedError
+        ConfigError
             It has none for one of the tasks that are known before any result is.
         """
         kind = self.options.executor

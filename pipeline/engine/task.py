@@ -28,14 +28,10 @@ BACK_OFF = 0.2
 PERMANENT = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
-class CodeChangedError(RilleError):
-    """The source code or the packages of a worker are not those of the client."""
-
-
-def code_changed() -> CodeChangedError:
+def code_changed() -> RilleError:
     """The error of a task whose key is another one on the worker."""
     text = "source code or packages of the worker are not those the run began with"
-    return CodeChangedError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
+    return RilleError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
 
 
 @dataclass(frozen=True)

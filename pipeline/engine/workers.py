@@ -66,10 +66,6 @@ DEATHS = 1
 """Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
 
 
-class ClusterError(RilleError):
-    """The scheduler or all of its workers are gone."""
-
-
 @dataclass(frozen=True)
 class Call:
     """A call of :func:`~rille.pipeline.engine.task.ensure`: an input is an artifact, or the number of the call in
@@ -374,7 +370,7 @@ class Dask:
 
         Raises
         ------
-        ClusterError
+        RilleError
             The scheduler is gone, or had no workers for too long.
         """
         try:
@@ -387,14 +383,14 @@ class Dask:
         elif now - self._manned > patience:
             text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
             remedy = "start workers, and run the same command: what is committed stays"
-            raise ClusterError("RIL-525", text, remedy=remedy)
+            raise RilleError("RIL-525", text, remedy=remedy)
         return sum(workers.values())
 
-    def _gone(self) -> ClusterError:
+    def _gone(self) -> RilleError:
         """The error of a scheduler that is gone."""
         text = f"the dask scheduler at {self._address} is gone"
         remedy = "start it again with its workers, and run the same command: what is committed stays"
-        return ClusterError("RIL-526", text, remedy=remedy)
+        return RilleError("RIL-526", text, remedy=remedy)
 
     def _look(self) -> None:
         """Look whether the scheduler is there and has workers, and which workers of our own are gone."""

@@ -83,7 +83,7 @@ def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterabl
 
     Raises
     ------
-    MemoryRefusedError
+    ConfigError
         A task does not fit even alone.
     """
     if planned:

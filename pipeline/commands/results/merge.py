@@ -28,7 +28,7 @@ from rille.stages.evaluation.dem_comparison import Alignment
 from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import RigidTransform, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.map_localization import independent_cells
+from rille.stages.terrain.map_localization import Placement, independent_cells
 from rille.stages.terrain.merge import EXACT, MergeParams, ModelLayer, Placed
 from rille.stages.terrain.merge import merge as merge_layers
 from rille.stages.terrain.relief.grid import Grid
@@ -119,17 +119,12 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     if not 1.0 / MAX_CELL_RATIO < ratio < MAX_CELL_RATIO:
         text = f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m"
         raise InputError("RIL-851", text, remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}")
-    a, b = first.place, other.place
-    if a is not None and b is not None:
-        refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
-        how, start, rough = "georeferences", _in_system(a).inverse() @ _in_system(b), np.zeros(6)
-    else:
-        placed = register((other.image, first.image), (other.grid, first.grid))
-        how, start, rough = placed.by, placed.pose, np.sqrt(np.diag(placed.covariance))
+    placed = _placed(first, other)
+    start, stated = placed.pose, first.place is not None and other.place is not None
     alignment = _aligned(other.grid, first.grid, start)
     error = dem_comparison.errors(other.grid, first.grid, start if alignment is None else alignment.pose)
     shared = np.isfinite(error)
-    if not shared.any() or (alignment is None and how != "georeferences"):
+    if not shared.any() or (alignment is None and not stated):
         text = f"{other.name} and {first.name} have too little ground in common to be laid on each other"
         raise DegenerateError("RIL-853", text, remedy="choose runs that share more ground")
     if alignment is None:
@@ -138,20 +133,30 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         alignment = Alignment(start, start.apply(other.grid.points()[shared]).mean(axis=0), np.zeros(6))
     # Errors of neighbours are alike: there are fewer than cells.
     sigma = alignment.sigma * math.sqrt(shared.sum() / max(independent_cells(error), 1.0))
+    rough = np.sqrt(np.diag(placed.covariance))
     sigma = np.where((sigma == 0.0) & np.isfinite(rough), rough, sigma)
     # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
     moved, pose = alignment.pose @ start.inverse(), alignment.pose
     motion = np.array([*(moved.apply(alignment.centre) - alignment.centre), *rotation_log(moved.rotation)])
-    if how == "georeferences" and (np.abs(motion) <= 3.0 * sigma).all():
+    if stated and (np.abs(motion) <= 3.0 * sigma).all():
         pose = start
     facts = {
         "run": other.name,
-        "by": how,
+        "by": placed.by,
         "T_first_world": pose.to_list(),
         "sigma_m_rad": sigma.tolist(),
         "overlap": dem_comparison.figures(error),
     }
     return Session(other, pose, sigma, alignment.centre, facts)
+
+
+def _placed(first: Terrain, other: Terrain) -> Placement:
+    """Where a run lies in the first one: as the georeferences of both state, else by ortho images or relief."""
+    a, b = first.place, other.place
+    if a is None or b is None:
+        return register((other.image, first.image), (other.grid, first.grid))
+    refuse_unlike_systems({other.name: b.crs, first.name: a.crs})
+    return Placement(_in_system(a).inverse() @ _in_system(b), np.zeros((6, 6)), "georeferences")
 
 
 def _in_system(place: Georeference) -> RigidTransform:
