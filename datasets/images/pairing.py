@@ -131,13 +131,18 @@ def writable(name: str) -> None:
         raise InputError("RIL-185", text, remedy="rename it")
 
 
+COUNTER = re.compile(r"(\d{3,})\D*$")
+"""The last number of a name, of a width that is filled with zeros."""
+
+
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
 
 
 def in_order(stems: Sequence[str]) -> list[str]:
-    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order."""
+    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order; those of
+    a counter that began anew from where it did not."""
     found = [DECIMAL.fullmatch(stem) for stem in stems]
     numbers = [match[2] for match in found if match]
     fractions = [number.partition(".")[2] for number in numbers]
@@ -146,7 +151,22 @@ def in_order(stems: Sequence[str]) -> list[str]:
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in stems]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
-    return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
+    ordered = sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
+    first = _begun_anew(ordered)
+    return ordered[first:] + ordered[:first]
+
+
+def _begun_anew(ordered: Sequence[str]) -> int:
+    """Place of the first of some names in order, before which a counter reached its last number (999) and went on from
+    0; 0: none did, as far as one can tell: more numbers are left out than there are."""
+    digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
+    if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
+        return 0
+    numbers = [int(text) for text in digits]
+    steps = np.diff(numbers)
+    if numbers[0] or numbers[-1] != 10 ** len(digits[0]) - 1 or steps.max(initial=0) <= len(numbers):
+        return 0
+    return int(np.argmax(steps)) + 1
 
 
 def ends(paths: Sequence[Path]) -> str:
@@ -220,6 +240,9 @@ def pair_up(
     """
     lines = [] if warnings is None else warnings
     left, right = (_sorted(paths, side) for side, paths in enumerate((left, right)))
+    if _begun_anew(sorted((path.stem for path in left), key=natural)):
+        text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
+        lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
     times = _times(left), _times(right)
     joined = join(*times, tolerance) if all(times) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
@@ -331,7 +354,7 @@ def counted(names: list[str]) -> list[str]:
     if len(names) < 3 or not all(name.isdecimal() for name in names):
         return names
     numbers = [int(name) for name in names]
-    if np.median(np.diff(numbers)) != 1 or numbers[-1] - numbers[0] + 1 > 2 * len(names):
+    if np.median(np.diff(numbers)) != 1 or not 0 < numbers[-1] - numbers[0] < 2 * len(names):
         return names
     by_number = dict(zip(numbers, names, strict=True))
     return [by_number.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]

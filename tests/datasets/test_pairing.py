@@ -268,3 +268,22 @@ def test_a_date_that_all_names_share_is_no_time_stamp():
     assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
     with raises("RIL-822", "not each has its own"):
         pair_up(left, right, "nearest")
+
+
+def test_a_counter_that_began_anew_goes_on_where_it_ended():
+    names, lines = [f"{k % 1000:03d}.png" for k in range(996, 1003)], []
+    shuffled = random.Random(1).sample(names, len(names))
+    pairs = pair_up(paths(*(f"l/{n}" for n in shuffled)), paths(*(f"r/{n}" for n in names)), gaps=True, warnings=lines)
+    assert [pair.left.name for pair in pairs] == [pair.right.name for pair in pairs] == names
+    assert lines == [
+        "RIL-707: the counter of the images began anew: they are taken from 996.png on to 002.png; if that is wrong, "
+        "rename them"
+    ]
+
+
+@pytest.mark.parametrize("numbers", [range(1000), [*range(400), *range(600, 1000)], [0, 1, 2], [0, 1, 998]])
+def test_numbers_from_the_least_to_the_greatest_are_no_counter_that_began_anew(numbers):
+    names, lines = [f"{k:03d}.png" for k in numbers], []
+    pairs = pair_up(paths(*(f"l/{n}" for n in names)), paths(*(f"r/{n}" for n in names)), warnings=lines)
+    assert [pair.left.name for pair in pairs] == names
+    assert not lines

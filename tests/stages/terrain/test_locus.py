@@ -506,3 +506,14 @@ def test_the_automatic_extent_ends_where_pixels_cover_too_many_cells() -> None:
     assert lattice.bounds[3] == pytest.approx(math.sqrt(5 * 0.1 * rig.left.fy * 1.65), rel=0.05)
     near = 1.65 * rig.left.fy / (rig.left.height - 1 - rig.left.cy)
     assert lattice.bounds[2] == pytest.approx(near, rel=0.05)
+
+
+def test_pixels_of_the_right_image_that_lead_to_what_moves_are_found() -> None:
+    shape, marked = (6, 20), np.zeros((6, 24), bool)
+    marked[1:4, 10:13] = True
+    usable = np.ones(shape, bool)
+    usable[2, 6] = False
+    back = Matches(np.full(shape, 5.3, np.float32), np.full(shape, -1.0, np.float32), usable)
+    expected = np.zeros(shape, bool)
+    expected[2:5, 5:8] = True
+    np.testing.assert_array_equal(stage._lead_to(back, marked), expected & usable)

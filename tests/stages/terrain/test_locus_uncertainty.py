@@ -185,3 +185,8 @@ def test_images_without_noise_or_contrast_leave_the_rest() -> None:
     elevation, seen = ground(rise=0.0)
     seen[1], seen[5] = seen[0], 0.0
     np.testing.assert_allclose(std(elevation, seen)[20, 25], FLOOR_PX / SCALE, rtol=1e-3)
+
+
+def test_a_row_of_cells_faces_as_level_ground_does() -> None:
+    lattice = Lattice.at(0, 0, 0.01, 1, 9)
+    np.testing.assert_array_equal(facing(np.zeros((1, 9), np.float32), lattice, np.array([0.0, 0.0, 1.0]), 3), 1.0)
