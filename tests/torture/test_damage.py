@@ -79,7 +79,7 @@ def run(cache, **options):
     try:
         result = driver.run(graph, Store(cache), driver.RunOptions(executor="inline", keep_going=True, force=force))
     except StoreError as error:  # refused before anything is computed
-        result = driver.Result(failures=[driver.Failure("the cache", "", error, "")])
+        result = driver.Result(failures=[driver.Failure("the cache", "", error)])
     return graph, result
 
 

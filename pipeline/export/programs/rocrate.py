@@ -128,7 +128,10 @@ def _sha256(path: Path) -> str:
 def describes_run(folder: Path) -> bool:
     """Whether a folder is a crate that holds a run, as data sets are crates, too."""
     path = folder / METADATA
-    return path.is_file() and '"#run"' in read_text(path, "crate", TABLE)
+    if not path.is_file():
+        return False
+    text = read_text(path, "crate", TABLE)
+    return '"#run"' in text or '"Dataset"' not in text
 
 
 def read(folder: Path) -> Crate:
