@@ -426,11 +426,9 @@ class Drive:
             # Whoever stopped first counts: what the other saw later was never driven.
             if seen is not None and (cut is None or seen < cut):
                 cut, kind, reason = seen, "obstacle", monitor.meta["reason"]
-        # Such stops belong to driving on.
-        usual = {"obstacle": "obstacle stop", "few": "stop"}
-        self.troubles = 0 if cut is None or kind in usual else self.troubles + 1
+        self.troubles = 0 if cut is None or kind == "obstacle" else self.troubles + 1
         if cut is not None:
-            stop.event = f"{usual.get(kind, 'safety stop')} at image {frames[cut]}: {reason}"
+            stop.event = f"{'obstacle stop' if kind == 'obstacle' else 'safety stop'} at image {frames[cut]}: {reason}"
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
                 stop.row = rows[frames[-1]]

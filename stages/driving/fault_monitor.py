@@ -3,7 +3,6 @@
     attitude      the inclinometer's tilt of the body beyond what the vehicle may have
     acceleration  a peak of the accelerometer: the vehicle has struck or dropped off something
     lost          fewer landmarks are followed than a pose needs
-    few           landmarks run out: it stops while its pose is known, and looks at new ones
     slip          the way by the wheels and the way by vision differ by more than their errors explain
 
 An image is judged by itself and those before it alone, as on the vehicle: the first one that is beyond a threshold is
@@ -29,8 +28,6 @@ MAX_ACCELERATION = 3.0
 """Vertical acceleration, m/s2, at which it stops; permitted steps cause less than half of it."""
 MIN_LANDMARKS = 12
 """Landmarks that agree with a pose; six determine it."""
-FEW_LANDMARKS = 40
-"""Of which a third is lost from image to image on the way over ground that leaves the view."""
 MAX_SLIP_SHARE = 0.2
 """Of the distance by the wheels; usual soil: 0.05 to 0.15."""
 MIN_SLIP_WHEELBASES = 0.3
@@ -104,8 +101,6 @@ def judge(
         contradiction = _disagreement(readings.odometry[k], moved, float(vehicle["wheel_base"]))
         if contradiction:
             return Verdict(k, "slip", contradiction)
-        if agree < FEW_LANDMARKS:
-            return Verdict(k, "few", f"landmarks run out: {agree} agree with the pose")
     return Verdict(None, "", "")
 
 
