@@ -38,9 +38,9 @@ from rille.stages.hfvm.level import (
 )
 from rille.stages.hfvm.native.problem import LevelPair, Map
 from rille.stages.hfvm.native.solver import solver
+from rille.stages.hfvm.native.threads import side_by_side
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.refinement import local_mean
-from rille.stages.hfvm.threads import side_by_side
 from rille.stages.numeric.windows import window_count, window_room
 
 FAILED_PX = np.float32(1e9)

@@ -21,9 +21,9 @@ from rille.stages.hfvm.image import Image, Layer, thinned
 from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
 from rille.stages.hfvm.native.reference import exhaustive
 from rille.stages.hfvm.native.solver import solver
+from rille.stages.hfvm.native.threads import side_by_side
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
-from rille.stages.hfvm.threads import side_by_side
 
 
 @njit(cache=True, nogil=True)
