@@ -332,6 +332,7 @@ class Drive:
     def _think(self, stop: Stop) -> Generator[Wait, Any, None]:
         """Plan the next leg by what is known at a stop, anew where a way turns out to be closed."""
         given = {"risk": stop.risk, "far": stop.far, "ceiling": stop.ceiling, "before": self.planned}
+        given["driven"] = self.products.trajectory
         known = {name: handle for name, handle in given.items() if handle is not None}
         follows, label = "again", f"leg/{stop.index}"
         while follows == "again":

@@ -183,6 +183,17 @@ class Ground:
         turn = self.turn_cost * self.vehicle.wheel_base
         return goals, *self.graph.search(goals, turn, self.reverse_cost, whole=whole)
 
+    def open_track(self, track: Sequence[tuple[float, float, float]]) -> None:
+        """Let the vehicle go back over places where it stood, x, y (m) and heading (rad) in order, whatever the map
+        says of them now."""
+        stands = np.array([*track, (*self.start, self.heading)])
+        stands[:, 2] = np.unwrap(stands[:, 2])
+        way, turn = np.hypot(*np.diff(stands[:, :2], axis=0).T), np.abs(np.diff(stands[:, 2]))
+        done = np.append(0.0, np.cumsum(2.0 * way / self.grid.spacing + turn / STEP_TURN))
+        between = np.linspace(0.0, done[-1], 1 + math.ceil(done[-1]))
+        x, y, angle = (np.interp(between, done, v) for v in stands.T)
+        self.graph.open_at(x, y, angle, LIKELY_COST)
+
     def opens(self, goals: Bools) -> bool:
         """Whether the vehicle may be at one of these places (row, col)."""
         return bool(np.isfinite(self.graph.pose[:, goals]).any())

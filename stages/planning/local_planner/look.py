@@ -76,18 +76,20 @@ AHEAD = FieldOfView(np.array([[0.0, 1.0, 0.0]]))
 
 @dataclass
 class PlannerMemory:
-    """Earlier looks of a vehicle.
+    """Earlier looks and places of a vehicle.
 
     Attributes
     ----------
     looks : number of looks since the last leg that was driven.
     closed : places (m); the ground around them was still unknown after it had been looked at.
     reopened : whether the closed places were tried once more, because no other path was left.
+    track : where the vehicle has stood, in order.
     """
 
     looks: int = 0
     closed: list[Point] = field(default_factory=list)
     reopened: bool = False
+    track: Sequence[Stand] = ()
 
     def after(self, verdict: str, where: Point | None = None) -> Literal["end", "again", "drive"]:
         """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.policy.Leg`); return what

@@ -7,9 +7,10 @@ planned over, at a higher cost, but are never driven on (the leg ends before the
 - ground that is hazardous only by the standard deviation of its elevations;
 - at a still higher cost, likely but not certain hazards and the shadows of stones: both mostly remain so from nearer.
 
-Ground that is certainly hazardous is closed, with the vehicle's margin around it. Ground that was seen only from afar
-counts as unknown, except for its hazards and for ground that is clearly free; it has a cost of its own, because the
-matcher's windows smooth away relief that is smaller than they are on the ground.
+Ground that is certainly hazardous is closed, with the vehicle's margin around it. Where that leaves no path, the
+vehicle may go back as it came, since its wheels have stood there, and look for another from where it was. Ground that
+was seen only from afar counts as unknown, except for its hazards and for ground that is clearly free; it has a cost of
+its own, because the matcher's windows smooth away relief that is smaller than they are on the ground.
 
 So the path avoids dead ends as soon as they are seen, and if no path is left even over unknown ground, there is none.
 This is the usual free-space assumption (Koenig, Tovey, Smirnov 2003, doi:10.1016/S0004-3702(03)00062-6), planned
@@ -132,7 +133,11 @@ def plan_leg(
         turn = 0.0 if memory.looks >= MAX_LOOKS else _free_turn(ground, memory.looks)
         if turn:
             return _stay("look", f"{why}: looks around", start, [], turn=turn)
-        return _stay("no path", why, start, [])
+        if memory.track:
+            ground.open_track(memory.track)
+            goals, cost, move = ground.search(goal, 0.5 * TOLERANCE_WHEELBASES * base)
+        if not np.isfinite(ground.from_start(cost)):
+            return _stay("no path", why, start, [])
     # Without this the cheaper of two ways round a stone may change at each stop, and the vehicle goes to and fro.
     way = kept if kept and price <= (1.0 + MIN_GAIN_SHARE) * least else ground.way(move)
     plan = _straight(ground, way)

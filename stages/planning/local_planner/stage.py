@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,6 +65,7 @@ def next_leg(
     meta = seen.near.meta
     lattice, vehicle = Lattice.from_dict(meta["lattice"]), Vehicle.model_validate(meta["vehicle"])
     for p_certain in params.p_certain_hazard:
+        last = p_certain == params.p_certain_hazard[-1]
         footing = Footing.of(
             hazards,
             lattice,
@@ -72,7 +74,7 @@ def next_leg(
             p_traversable=params.p_max_traversable,
             bounds=seen.bounds,
         )
-        leg = plan_leg(footing, stand, goal, params, memory, before, view)
+        leg = plan_leg(footing, stand, goal, params, memory if last else replace(memory, track=()), before, view)
         if leg.verdict == "goal" or len(leg.way) > 1:
             break
     return leg
@@ -114,7 +116,7 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
 
 class LegInputs(NamedTuple):
     """Hazards of near ground, of all that was seen, and bounds of the ground that was not; pose and rig of the cameras;
-    the leg before."""
+    the leg before; poses of the left camera on the way so far."""
 
     risk: Bundle[RiskFacts]
     pose: Bundle
@@ -122,11 +124,12 @@ class LegInputs(NamedTuple):
     far: Bundle[RiskFacts] | None = None
     ceiling: Bundle[BoundsFacts] | None = None
     before: Bundle[LegFacts] | None = None
+    driven: Bundle | None = None
 
 
 @stage(
     "local_planner",
-    version=11,
+    version=12,
     outputs=[
         Array(
             "path",
@@ -155,10 +158,13 @@ def local_planner_stage(
     whole: bool = False,
 ) -> Bundle[LegFacts]:
     """The next leg of a drive to a goal, over ground that is known to be free."""
-    T_world_left = RigidTransform.from_matrix(np.asarray(inputs.pose["poses"])[-1])
-    stand = from_above(T_world_left @ T_vehicle_left.inverse())
+    T_left_vehicle = T_vehicle_left.inverse()
+    stand, *track = (
+        from_above(RigidTransform.from_matrix(pose) @ T_left_vehicle)
+        for pose in (np.asarray(inputs.pose["poses"])[-1], *(() if inputs.driven is None else inputs.driven["poses"]))
+    )
     end = (float(goal[0]), float(goal[1]))
-    memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed])
+    memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed], track=track)
     rest, before, ceiling = None, inputs.before, inputs.ceiling
     if before is not None and len(before["rest_gear"]):
         rest = np.asarray(before["rest"]), np.asarray(before["rest_gear"])

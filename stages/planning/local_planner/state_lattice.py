@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.lattice import Lattice
@@ -33,6 +34,8 @@ HEADING_STEPS = np.concatenate([HEADING_STEPS, -HEADING_STEPS])
 HEADING_ANGLES = np.mod(np.arctan2(-HEADING_STEPS[:, 1], -HEADING_STEPS[:, 0]), 2 * np.pi)
 STEP_LENGTHS = np.hypot(HEADING_STEPS[:, 0], HEADING_STEPS[:, 1])
 AHEAD, BACK, TO_LEFT, TO_RIGHT = 0, 1, 2, 3
+MAX_OFF_TRACK = math.radians(25.0)
+"""Of a heading of the lattice from one that was driven; the next heading is at most 27 degrees away."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,12 @@ class PoseGrid:
         c, s = math.cos(self.heading), math.sin(self.heading)
         return self.middle[0] + c * right - s * ahead, self.middle[1] + s * right + c * ahead
 
+    def index(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+        """Fractional rows and columns of places, m."""
+        dx, dy = (x - self.middle[0]) / self.spacing, (y - self.middle[1]) / self.spacing
+        c, s = math.cos(self.heading), math.sin(self.heading)
+        return self.origin[0] + s * dx - c * dy, self.origin[1] + c * dx + s * dy
+
 
 @dataclass(frozen=True)
 class LatticeGraph:
@@ -100,6 +109,21 @@ class LatticeGraph:
                 gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
                 known[where, k], price[where, k] = prices(gaps, x, y)
         return LatticeGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
+
+    def open_at(self, x: Floats, y: Floats, heading: Floats, price: float) -> None:
+        """Make the poses (n,) at x, y (m) and heading (rad), and those next to them, known at this price at most;
+        places beside the lattice are left out."""
+        row, col = (np.rint(v).astype(np.int64) for v in self.grid.index(x, y))
+        inside = (row >= 0) & (row < self.grid.shape[0]) & (col >= 0) & (col < self.grid.shape[1])
+        on = np.zeros(self.pose.shape, np.bool_)
+        for k, angle in enumerate(HEADING_ANGLES):
+            off = np.remainder(heading - self.grid.heading - angle + np.pi, 2 * np.pi) - np.pi
+            along = inside & (np.abs(off) < MAX_OFF_TRACK)
+            on[k % HALF_TURN_HEADINGS, row[along], col[along]] = True
+        on = ndimage.binary_dilation(on, np.ones((1, 3, 3)))
+        for cost, known in zip((self.pose, self.step, self.turn), self.known, strict=True):
+            cost[on] = np.minimum(cost[on], price)
+            known[on] = True
 
     def search(
         self, goals: Bools, turn_price: float, back: float, *, whole: bool = False

@@ -460,3 +460,17 @@ def test_a_goal_nearer_than_the_shortest_leg_is_driven_to_though_the_way_is_made
     goal = 0.035 * math.cos(angle), 0.3 + 0.035 * math.sin(angle)
     leg = plan_leg(ground(), (0.0, 0.3, 0.0), goal, P)
     assert leg.verdict in ("drive", "turn")
+
+
+def test_from_where_every_way_is_closed_it_goes_back_as_it_came() -> None:
+    came = [(0.0, y, 0.0) for y in (0.0, 0.15, 0.3)]
+    walls = (np.abs(X) < 0.15) & (np.abs(Y - 0.3) < 0.15) & ((np.abs(X) > 0.065) | (np.abs(Y - 0.3) > 0.12))
+    around = ground((walls, HAZARDOUS))
+    assert plan_leg(around, came[-1], GOAL, P, TIRED).verdict == "no path"
+    leg = plan_leg(around, came[-1], GOAL, P, PlannerMemory(MAX_LOOKS, track=came))
+    assert leg.verdict == "drive"
+    assert leg.gear.tolist()[0] == -1
+    assert leg.path[-1, 1] < 0.15
+    assert np.abs(leg.path[:, 0]).max() < 0.011
+    # Beside the track, the ground is closed as before.
+    assert plan_leg(around, came[-1], GOAL, P, PlannerMemory(MAX_LOOKS, track=came[1:])).verdict == "no path"
