@@ -10,6 +10,8 @@ predicts.
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +33,7 @@ from rille.datasets.manifest.rig import CAR, STREET, Optics, read_optics, unusua
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import TABLE, read_bytes
+from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import NoParams
@@ -61,9 +63,10 @@ class TakenImage:
 def is_bag(path: Path) -> bool:
     """Whether a path is called as bags are."""
     about = path / "metadata.yaml"
-    return (path.is_file() and path.suffix in SUFFIXES) or (
-        about.is_file() and b"rosbag2_bagfile_information" in read_bytes(about, "bag's metadata", TABLE)
-    )
+    if not os.path.isfile(about):  # not pathlib's, which raises where a name is too long
+        return os.path.isfile(path) and path.suffix in SUFFIXES
+    with open_regular(about, "bag's metadata", sys.maxsize) as file:
+        return b"rosbag2_bagfile_information" in file.read(SMALL)
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:

@@ -42,7 +42,12 @@ WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
 WORDS = (
-    (re.compile(r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow"), lambda m: "time"),
+    (
+        re.compile(
+            r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
+        ),
+        lambda m: "time",
+    ),
     # Tools of ROS write the path of a field before its name.
     (re.compile(r"(.*[./])?(q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
@@ -58,6 +63,9 @@ WORDS = (
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
 DEGREES = re.compile(r"\b(lat|lon)")
+
+NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
+"""Name of a column behind that of the whole seconds, as ROS stamps messages."""
 
 TIME_UNIT = re.compile(r"[\[(_ ](s|ms|us|ns)[\])]?$")
 """At the end of the name of a column of times."""
@@ -173,7 +181,11 @@ def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
     said = TIME_UNIT.search(table.header[column]) if table.header else None
-    return seconds(table.text(column), table.name, unit=said[1] if said else "auto", lines=table.lines)
+    stamps, unit = table.text(column), said[1] if said else "auto"
+    if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
+        both = zip(stamps, table.text(column + 1), strict=True)
+        stamps, unit = [f"{s}.{ns:0>9}" if (s + ns).isdecimal() else f"{s} {ns}" for s, ns in both], "s"
+    return seconds(stamps, table.name, unit=unit, lines=table.lines)
 
 
 def names_positions(table: TextTable) -> bool:
@@ -183,8 +195,9 @@ def names_positions(table: TextTable) -> bool:
 
 def _column(table: TextTable, stated: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
-    if isinstance(stated, str) and stated.strip().lower() in table.header:
-        return table.header.index(stated.strip().lower())
+    for names in (table.header, [name.rpartition(" [")[0] for name in table.header]):  # without its unit
+        if isinstance(stated, str) and stated.strip().lower() in names:
+            return names.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:
         return stated - 1
     text = f"{table.name}: columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"

@@ -72,7 +72,8 @@ def opened(path: Path) -> Iterator[Any]:
         text = f"{path}: bags are read by the package rosbags"
         raise InputError("RIL-940", text, remedy="pip install 'rille[robots]'") from error
     for file in path.iterdir() if path.is_dir() else (path,):
-        open_regular(file, "bag", sys.maxsize).close()
+        if not file.is_dir():
+            open_regular(file, "bag", sys.maxsize).close()
     try:
         # bags of ROS 2 before Iron hold no definitions of their messages
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

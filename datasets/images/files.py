@@ -279,11 +279,12 @@ class Digests:
     def __init__(self, memory: Path | None = None) -> None:
         self._memory = memory
         self._known: dict[str, str] = {}
-        if memory is not None and memory.is_file():
-            for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-                digest, _, key = line.partition(" ")
-                if len(digest) == 64:
-                    self._known[key] = digest
+        with suppress(OSError):  # that of a shared cache may be its owner's alone
+            if memory is not None and memory.is_file():
+                for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
+                    digest, _, key = line.partition(" ")
+                    if len(digest) == 64:
+                        self._known[key] = digest
 
     def whole(self, path: Path) -> bool:
         """Whether an image file may be taken; one that somebody still writes may not."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.graph import Handle
+from rille.pipeline.engine.runtime.atomic import named
 from rille.pipeline.engine.spec import each
 
 
@@ -49,7 +50,8 @@ class Ledger:
         self._line({"run": facts})
 
     def _line(self, row: dict[str, Any]) -> None:
-        self._file.write(json.dumps(row) + "\n")
+        with named(Path(self._file.name)):
+            self._file.write(json.dumps(row) + "\n")
 
     def close(self) -> None:
         """Close the file."""

@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import rille
+from rille.datasets.bags import is_bag
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
 from rille.stages.core.declare import declared
@@ -123,9 +124,19 @@ def pixels(sequence, frame, camera):
     return np.asarray(run(sequence.image(frame, camera))["image"])
 
 
+def test_a_large_file_that_is_called_as_a_bags_makes_no_bag(tmp_path):
+    with (tmp_path / "metadata.yaml").open("wb") as file:
+        file.truncate(200_000_000)
+    assert not is_bag(tmp_path)
+    assert not is_bag(tmp_path / ("x" * 300))
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_rectified_pairs_come_back_as_they_were_written(tmp_path, form):
-    sequence = open_sequence(str(street(form).write(tmp_path)))
+    path = street(form).write(tmp_path)
+    if path.is_dir():
+        (path / "notes").mkdir()
+    sequence = open_sequence(str(path))
     assert sequence.frames == 3
     assert sequence.times == pytest.approx([1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2])
     assert sequence.rig.baseline == pytest.approx(0.5)

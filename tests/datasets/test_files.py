@@ -217,3 +217,10 @@ def test_a_memo_that_cannot_be_written_is_left_out(tmp_path, grey):
     first = Digests(tmp_path / "file" / "digests").sha256(path)
     for _ in range(2):
         assert Digests(tmp_path / "digests").sha256(path) == first
+
+
+def test_a_memo_that_cannot_be_read_is_left_out(tmp_path, grey):
+    path = tmp_path / "a.png"
+    path.write_bytes(encoded(grey))
+    (tmp_path / "digests").symlink_to("/proc/self/mem")  # a regular file whose first byte cannot be read
+    assert Digests(tmp_path / "digests").sha256(path) == Digests().sha256(path)

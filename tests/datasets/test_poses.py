@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses
+from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses, read_positions
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -188,3 +188,21 @@ def test_positions_alone_are_said_to_lack_a_rotation(tmp_path, header):
     rows = "\n".join(",".join(str(k + j) for j in range(header.count(",") + 1)) for k in range(3))
     with raises("RIL-801", "qw", *header.split(",")[1:3]):
         read(tmp_path, f"{header}\n{rows}\n")
+
+
+def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_path):
+    rows = "1,0,0,0,0.1,0.2,0.3,0.927\n2,0,0,0,0.1,0.2,0.3,0.927\n"
+    plain, with_units = (read(tmp_path, f"time,x,y,z,qx,qy,qz,qw\n{units}{rows}") for units in ("", "s,m,m,m,,,,\n"))
+    np.testing.assert_array_equal(plain.poses[0].rotation, with_units.poses[0].rotation)
+
+
+@pytest.mark.parametrize("names", ["secs,nsecs", "field.header.stamp.sec,field.header.stamp.nanosec"])
+def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path, names):
+    (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,100000000,1,2\n1400000001,9000,1,3\n")
+    found = read_positions(tmp_path / "p.csv", "auto", {"time": names.partition(",")[0]})
+    assert found is not None
+    assert found.times == pytest.approx((1400000000.1, 1400000001.000009), abs=1e-6)
+    assert read_positions(tmp_path / "p.csv", "auto", {}) == found
+    (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,1e8,1,2\n")
+    with raises("RIL-291", "line 2", "1e8"):
+        read_positions(tmp_path / "p.csv", "auto", {})

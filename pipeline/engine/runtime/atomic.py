@@ -34,7 +34,7 @@ def replacing(path: Path) -> Iterator[Path]:
     # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
-        with _named(path):
+        with named(path):
             yield apart / path.name
         if path.exists() and path.is_dir() != (apart / path.name).is_dir():
             number = errno.EISDIR if path.is_dir() else errno.ENOTDIR
@@ -52,7 +52,7 @@ def write(path: Path, data: bytes | str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)  # without a folder of its own, which takes ten times as long
     try:
-        with _named(path):
+        with named(path):
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
         os.replace(temporary, path)
     finally:
@@ -108,7 +108,7 @@ def remove(path: Path, modified: float) -> None:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def named(path: Path) -> Iterator[None]:
     """Name the file in errors of a block; that of a write to a full disk has no name."""
     try:
         yield
