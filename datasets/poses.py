@@ -6,12 +6,14 @@ Forms of a file, one pose T_reference_body a row:
 * ``tum``: time, x y z, quaternion x y z w;
 * ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
-  ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
+  ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``);
+  of a robot on a plane ``x y`` and ``yaw`` or ``theta``.
 
 Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as the manifest
 states.
 
-Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
+Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Coordinates and angles without a column
+are 0.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ WORDS = (
     (re.compile(r"(.*[./])?(q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
-    (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
+    (re.compile(r"(roll|pitch|yaw)|theta"), lambda m: m[1] or "yaw"),
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
     (re.compile(r"up|height|alt|altitude|elevation"), lambda m: "z"),
@@ -114,8 +116,8 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
         table, warnings = table.measured(list(columns.values()), ~turned if "qw" in columns else False)
     times = times_of(table, columns["time"]) if "time" in columns else None
     rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)
-    placed = [columns[axis] for axis in POSITION if axis in columns]
-    positions = table.numbers(placed) if len(placed) == 3 else np.zeros((len(table.rows), 3))
+    nothing = np.zeros((len(table.rows), 1))
+    positions = np.hstack([table.numbers([columns[axis]]) if axis in columns else nothing for axis in POSITION])
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
     return TimedPoses(times, poses, table.name, warnings)
 
@@ -224,12 +226,12 @@ def _whole(columns: Mapping[str, int]) -> bool:
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
     """Columns of poses, by their names or in the order of the format."""
     if format in ("auto", "csv"):
-        if _whole(meant):
+        if _whole(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
             return meant
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
-            remedy = "add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone are [positions] or [truth]"
+            remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())
@@ -247,8 +249,10 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     """Rotation matrices (n, 3, 3) of roll, pitch and yaw, in the unit that the names say, or the figures alone."""
     from scipy.spatial.transform import Rotation
 
-    values = table.numbers([columns[a] for a in ANGLES])
-    units = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
+    known = [k for k, a in enumerate(ANGLES) if a in columns]
+    values = np.zeros((len(table.rows), 3))
+    values[:, known] = table.numbers([columns[ANGLES[k]] for k in known])
+    units = {unit for k in known for unit in ("deg", "rad") if unit in table.header[columns[ANGLES[k]]]}
     if not units and np.abs(values).max() > 2 * np.pi:
         units = {"deg"}
     if len(units) != 1:

@@ -54,6 +54,11 @@ ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
 
 _STDERR = threading.Lock()
 
+LIBJPEG = re.compile(
+    rb"(Corrupt JPEG|Premature end of|Inconsistent progression|Invalid SOS|Unknown Adobe|Warning: unknown JFIF).*\n?"
+)
+"""Warnings of libjpeg (its ``jerror.h``)."""
+
 COLOUR = Array(
     "colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of the left image", optional=True
 )
@@ -80,7 +85,8 @@ def _damaged(text: str) -> InputError:
 def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
     """Image of an encoded file as it is stored, None: it cannot be decoded; and what speaks against it, in words.
 
-    libjpeg tells of damage on the process's stderr alone, and gives some image all the same.
+    libjpeg tells of damage on the process's stderr alone, where other threads may write, too; and gives some image all
+    the same.
     """
     if not data.startswith(JPEG):
         return _decoded(data), ""
@@ -96,10 +102,13 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
             os.dup2(kept, 2)
             os.close(kept)
         aside.seek(0)
-        said = aside.read().decode(errors="replace").strip()
-    padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", said)
+        said = aside.read()
+    with suppress(OSError):
+        os.write(2, LIBJPEG.sub(b"", said))
+    complaints = "; ".join(match[0].decode(errors="replace").strip() for match in LIBJPEG.finditer(said))
+    padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", complaints)
     # Bytes before a JPEG's end marker that are no damage: webcams pad their images
-    return image, "" if padding and int(padding[1]) <= 16 else said
+    return image, "" if padding and int(padding[1]) <= 16 else complaints
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:

@@ -206,3 +206,11 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path, names):
     (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,1e8,1,2\n")
     with raises("RIL-291", "line 2", "1e8"):
         read_positions(tmp_path / "p.csv", "auto", {})
+
+
+@pytest.mark.parametrize("header", ["time,x,y,yaw_deg", "time,x,y,theta [deg]", "time,x,y,qx,qy,qz,qw"])
+def test_a_robot_on_a_plane_has_neither_height_nor_tilt(tmp_path, header):
+    turn = "0,0,0.7071068,0.7071068" if "qw" in header else "90"
+    found = read(tmp_path, f"{header}\n1,2,3,{turn}\n2,3,3,{turn}\n")
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-6)
+    np.testing.assert_array_equal([pose.translation for pose in found.poses], [[2, 3, 0], [3, 3, 0]])

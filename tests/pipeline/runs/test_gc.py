@@ -75,6 +75,14 @@ def test_artifacts_behind_a_link_are_cleared_away_and_nothing_else_behind_links(
     assert (mine / "notes.txt").exists()
 
 
+def test_a_damaged_line_of_a_ledger_costs_its_task_alone(two):
+    _, first, _ = two
+    whole, ledger = lookup.used(first), first / lookup.LEDGER
+    lines = ledger.read_bytes().splitlines(keepends=True)
+    ledger.write_bytes(b"".join([lines[0], b"\xff" + lines[1], *lines[2:]]))
+    assert len(lookup.used(first)) == len(whole) - 1
+
+
 def test_what_cannot_be_set_aside_is_not_said_to_be(two, capsys, monkeypatch):
     folder, _, _ = two
     store = Store(folder / "cache")
