@@ -69,14 +69,13 @@ def seconds(
     exact = [_decimal(v, what, k) for v, k in zip(values, at, strict=True)]
     if not exact:
         return ()
-    in_order = zip(at[1:], exact, exact[1:], strict=False)
     stated = unit if unit != "auto" else _unit(exact, what, at)
-    for line, before, now in in_order:
-        if now <= before:
-            words = "is there twice" if now == before else f"goes back from {before}"
-            text = f"{what}, line {line}: time {now} {words}"
-            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
+    for k in range(1, len(times)):
+        if times[k] <= times[k - 1]:
+            words = "is there twice" if times[k] == times[k - 1] else f"goes back from {exact[k - 1]}"
+            text = f"{what}, line {at[k]}: time {exact[k]} {words}"
+            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
     # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
     # likelier, and no camera takes ten million images a second.
