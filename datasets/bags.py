@@ -210,9 +210,8 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
             stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
             cameras = Cameras.model_validate({**stated, "names": beside.names})
             manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
-            line = warning(
-                "RIL-825", f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
-            )
+            text = f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
+            line = warning("RIL-825", text)
             optics = read_optics(manifest, path.parent, str(path), sizes)
             return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
     (left, turned), (right, _) = (_camera(reader, path, topic) for topic in topics)

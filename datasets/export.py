@@ -83,17 +83,13 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
             _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
-    text = (
-        Path(__file__)
-        .with_name(README)
-        .read_text(encoding="utf-8")
-        .format(
-            name=sequence.name,
-            frames=len(frames),
-            size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
-            notes="\n".join(sequence.notes),
-            truth_source=sequence.truth_source or "no truth is known",
-        )
+    text = Path(__file__).with_name(README).read_text(encoding="utf-8")
+    text = text.format(
+        name=sequence.name,
+        frames=len(frames),
+        size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
+        notes="\n".join(sequence.notes),
+        truth_source=sequence.truth_source or "no truth is known",
     )
     (folder / "README.txt").write_text(text, encoding="utf-8")
 

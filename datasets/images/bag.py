@@ -6,6 +6,7 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
-from rille.datasets.images.headers import Header
+from rille.datasets.images.headers import Header, read_header
 from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
@@ -87,10 +88,9 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def depth(message: Any, name: str) -> Header:
-    """Width, height and bits of the image of a message."""
+    """Width, height and bits of the image of a message; one that is damaged further on costs its frame alone."""
     if hasattr(message, "format"):
-        found = files.decode(bytes(message.data), name)
-        return Header(found.shape[1], found.shape[0], found.dtype.itemsize * 8)
+        return files.usable(read_header(BytesIO(bytes(message.data))), name)
     return Header(int(message.width), int(message.height), _layout(message, name)[1])
 
 

@@ -120,9 +120,8 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
     except cv2.error:
         return None
     # But OpenCV turns a TIFF by its tag whatever it is asked for.
-    return (
-        image if image is None or not data.startswith(TIFF) else _turned_back(image, orientation(opened(BytesIO(data))))
-    )
+    turned = image is not None and data.startswith(TIFF)
+    return _turned_back(image, orientation(opened(BytesIO(data)))) if turned else image
 
 
 def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:
@@ -167,7 +166,7 @@ def decode_colour(
     damage = _damage(data)
     if damage:
         raise _damaged(f"{name} {damage}")
-    header = _sound(read_header(BytesIO(data)), name)
+    header = usable(read_header(BytesIO(data)), name)
     if wanted is not None:
         check_size(header._replace(depth=wanted.depth), wanted, name)
     image, complaint = _unpacked(data)
@@ -195,7 +194,7 @@ def decode_colour(
     return grey, colour
 
 
-def _sound(header: Header | None, name: str) -> Header:
+def usable(header: Header | None, name: str) -> Header:
     """A header of an image that may be decoded."""
     if header is None:
         kind = kind_of(name)
@@ -248,7 +247,7 @@ def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
     refused |= unlike
     if 2 * count <= len(headers):
         raise next(iter((unlike or refused).values()))
-    _sound(wanted, str(next(path for path in paths if path not in refused)))
+    usable(wanted, str(next(path for path in paths if path not in refused)))
     return wanted, {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
 
 

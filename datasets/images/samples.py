@@ -118,10 +118,8 @@ def _orientations(left: set[int], right: set[int]) -> list[str]:
         return []
     words = f"EXIF orientations are {sorted(left)} of left images and {sorted(right)} of right ones"
     if left != right or len(left) > 1:
-        remedy = (
-            "turn the pixels (magick mogrify -auto-orient FILES), or remove the tags (exiftool -Orientation= FILES)"
-        )
-        raise InputError("RIL-828", f"{words}: which pixels are those of the calibration is not known", remedy=remedy)
-    return [
-        warning("RIL-829", f"{words}: they are ignored, the calibration is taken for the pixels as they are stored")
-    ]
+        text = f"{words}: which pixels are those of the calibration is not known"
+        remedy = "turn the pixels (magick mogrify -auto-orient FILES), or remove the tags: exiftool -Orientation= FILES"
+        raise InputError("RIL-828", text, remedy=remedy)
+    text = f"{words}: they are ignored, the calibration is taken for the pixels as they are stored"
+    return [warning("RIL-829", text)]

@@ -279,6 +279,20 @@ def test_a_short_image_and_a_changed_bag_are_refused(tmp_path):
         pixels(sequence, 2, "left")
 
 
+def test_a_compressed_image_that_breaks_off_costs_its_frame_alone(tmp_path):
+    bag = street(frames=0)
+    for k in range(3):
+        for side, topic in enumerate((LEFT, RIGHT)):
+            data = cv2.imencode(".jpg", picture(k, side))[1].tobytes()
+            bag.compressed(f"{topic}/compressed", START + k * STEP, data[: len(data) // 2] if k == 1 else data)
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.frames == 3
+    damaged = run(sequence.image(1, "left"))
+    assert "decoded" in damaged.meta["damage"]
+    assert not damaged["valid"].any()
+    assert "damage" not in run(sequence.image(2, "left")).meta
+
+
 def test_images_without_a_partner_are_left_out(tmp_path):
     bag = street()
     bag.rows.pop()
