@@ -120,8 +120,9 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
     except cv2.error:
         return None
     # But OpenCV turns a TIFF by its tag whatever it is asked for.
-    turned = image is not None and data.startswith(TIFF)
-    return _turned_back(image, orientation(opened(BytesIO(data)))) if turned else image
+    if image is not None and data.startswith(TIFF):
+        return _turned_back(image, orientation(opened(BytesIO(data))))
+    return image
 
 
 def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:

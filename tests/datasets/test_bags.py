@@ -224,6 +224,13 @@ def test_imu_and_odometry_count_where_tf_static_places_them(tmp_path):
     assert sequence.odometry[2].translation == pytest.approx([0.2 + 0.4, 0.1, 0.8])
     assert sequence.odometry[2].rotation == pytest.approx(T_base_camera.rotation)
     assert sequence.attitude[0] is not None
+    # Drivers repeat messages, and odometry may begin without a rotation: that costs no more than the sensor.
+    bag.rows += [row for row in bag.rows if row[0] == "/imu"]
+    first = next(m for topic, _, m in bag.rows if topic == "/odom")
+    first.pose.pose.orientation = bag.vector([0, 0, 0, 0], "geometry_msgs/msg/Quaternion")
+    partly = open_sequence(str(bag.write(tmp_path / "partly")))
+    assert (partly.attitude, partly.odometry) == (sequence.attitude, None)
+    assert [line for line in partly.warnings if "/odom" in line and "RIL-951" in line]
     lone = street(frames=2)
     lone.add("/imu", START, next(m for topic, _, m in bag.rows if topic == "/imu"))
     assert any("RIL-951" in line for line in open_sequence(str(lone.write(tmp_path / "lone"))).warnings)
@@ -291,6 +298,16 @@ def test_a_compressed_image_that_breaks_off_costs_its_frame_alone(tmp_path):
     assert "decoded" in damaged.meta["damage"]
     assert not damaged["valid"].any()
     assert "damage" not in run(sequence.image(2, "left")).meta
+
+
+def test_images_without_time_stamps_are_refused(tmp_path):
+    """All of them but one would be left out."""
+    bag = street(frames=3)
+    for topic, _, message in bag.rows:
+        if topic in (LEFT, RIGHT):
+            message.header = bag.header(0)
+    with raises("RIL-939", LEFT, "3 images", "1 time stamp"):
+        open_sequence(str(bag.write(tmp_path)))
 
 
 def test_images_without_a_partner_are_left_out(tmp_path):
