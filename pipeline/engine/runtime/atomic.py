@@ -48,12 +48,15 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write(path: Path, data: bytes | str) -> None:
-    """Replace a file (text is UTF-8). It is not flushed: for what may be lost, but not be half."""
+    r"""Replace a file. It is not flushed: for what may be lost, but not be half.
+
+    Text is UTF-8; bytes of file names that are none are spelt out (``\udce9``).
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)  # without a folder of its own, which takes ten times as long
     try:
         with named(path):
-            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+            temporary.write_bytes(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
