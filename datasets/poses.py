@@ -110,13 +110,13 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
         return TimedPoses(None, _matrices(table), table.name)
     columns = _columns(table, format, meant)
-    warnings: tuple[str, ...] = ()
+    warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
         # Trackers that have lost their target write zeros.
-        turned = np.asarray(table.values([columns[q] for q in QUATERNION if q in columns]).any(axis=1))
-        table, warnings = table.measured(list(columns.values()), ~turned if "qw" in columns else False)
+        lost = ~table.values([columns[q] for q in QUATERNION]).any(axis=1) if quaternion else False
+        table, warnings = table.measured(list(columns.values()), lost)
     times = times_of(table, columns["time"]) if "time" in columns else None
-    rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)
+    rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
     positions = np.hstack([table.numbers([columns[axis]]) if axis in columns else nothing for axis in POSITION])
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
@@ -162,8 +162,8 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
         if any(map(DEGREES.search, table.header)):
             remedy = "project latitude and longitude to metres, as UTM has them, in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
-    placed = [meant[axis] for axis in POSITION if axis in meant]
-    placed = [k for k in placed if not np.isnan(table.values([k])).all()] or placed
+    placed = [meant["x"], meant["y"]]
+    placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
     times, warnings = None, tuple[str, ...]()
     if "time" in meant:  # else rows are pairs
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))

@@ -214,3 +214,18 @@ def test_a_robot_on_a_plane_has_neither_height_nor_tilt(tmp_path, header):
     found = read(tmp_path, f"{header}\n1,2,3,{turn}\n2,3,3,{turn}\n")
     np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-6)
     np.testing.assert_array_equal([pose.translation for pose in found.poses], [[2, 3, 0], [3, 3, 0]])
+
+
+def test_a_part_of_a_quaternion_beside_angles_is_none(tmp_path):
+    found = read(tmp_path, "time,qw,roll_deg,pitch_deg,yaw_deg\n1,7,0,0,90\n2,7,0,0,90\n")
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
+
+
+def test_positions_without_a_measured_coordinate_are_refused_and_without_heights_have_none(tmp_path):
+    for text, row in (("time,x,y\n1,,2\n2,,3\n", "line 2"), ("time,x,y,z\n1,2,3,\n2,4,5,\n", "")):
+        (tmp_path / "p.csv").write_text(text)
+        if row:
+            with raises("RIL-284", row):
+                read_positions(tmp_path / "p.csv", "auto", {})
+        else:
+            assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
