@@ -356,4 +356,4 @@ def _point_latest(folder: Path) -> None:
         link.replace(folder.parent / "latest")
     except OSError as error:  # of a file system without links; the results are whole
         text = f"{folder.parent / 'latest'} does not lead to this run: {error.strerror}; name it as {folder.name}"
-        warn(warning("RIL-737", text))
+        warn(warning("RIL-741", text))

@@ -38,7 +38,7 @@ def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, caps
     monkeypatch.setattr(Path, "symlink_to", refuse)
     folder = session._make_folder(tmp_path, NOW, "plan")
     session._point_latest(folder)
-    assert "RIL-737" in (said := capsys.readouterr().err)
+    assert "RIL-741" in (said := capsys.readouterr().err)
     assert folder.name in said
 
 
