@@ -113,8 +113,8 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
         # Trackers that have lost their target write zeros.
-        lost = ~table.values([columns[q] for q in QUATERNION]).any(axis=1) if quaternion else False
-        table, warnings = table.measured(list(columns.values()), lost)
+        lost = ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1) if quaternion else False
+        table, warnings = table.measured(list(columns.values()), np.asarray(lost))
     times = times_of(table, columns["time"]) if "time" in columns else None
     rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
@@ -198,7 +198,7 @@ def names_positions(table: TextTable) -> bool:
 
 def _column(table: TextTable, stated: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
-    for names in (table.header, [name.rpartition(" [")[0] for name in table.header]):  # without its unit
+    for names in (table.header, [name.partition(" [")[0] for name in table.header]):  # without its unit
         if isinstance(stated, str) and stated.strip().lower() in names:
             return names.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:

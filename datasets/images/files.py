@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -312,14 +312,11 @@ class Digests:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
                 # Appended, not rewritten: two runs at once both keep what they found, and a torn line is passed over.
-                with suppress(OSError), _appended(self._memory) as file:
-                    file.write(f"{self._known[key]} {key}\n")
+                with suppress(OSError):
+                    self._memory.parent.mkdir(parents=True, exist_ok=True)
+                    with self._memory.open("a", encoding="utf-8", errors="surrogateescape") as memory:
+                        memory.write(f"{self._known[key]} {key}\n")
         return self._known[key]
-
-
-def _appended(path: Path) -> TextIO:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.open("a", encoding="utf-8", errors="surrogateescape")
 
 
 def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:

@@ -99,13 +99,9 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
     return exact
 
 
-def _magnitude(value: Decimal) -> str:
-    return next((unit for unit, upper in UPPER.items() if abs(value) < upper), "ns")
-
-
 def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
     """The unit that all stamps have by their magnitude."""
-    units = [_magnitude(v) for v in exact]
+    units = [next((unit for unit, upper in UPPER.items() if abs(v) < upper), "ns") for v in exact]
     for k, unit in enumerate(units):
         if unit != units[0]:
             text = f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({units[0]} and {unit})"
