@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import seconds
+from rille.datasets.text.times import of_two, seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
@@ -186,8 +186,7 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     said = TIME_UNIT.search(table.header[column]) if table.header else None
     stamps, unit = table.text(column), said[1] if said else "auto"
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
-        both = zip(stamps, table.text(column + 1), strict=True)
-        stamps, unit = [f"{s}.{ns:0>9}" if (s + ns).isdecimal() else f"{s} {ns}" for s, ns in both], "s"
+        stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
 
 

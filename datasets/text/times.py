@@ -42,6 +42,11 @@ def undated(text: str) -> str:
     return DATE.sub(since, text)
 
 
+def of_two(whole: str, nanoseconds: str) -> str:
+    """Seconds of a stamp in two cells, as ROS has them; no number where they are none."""
+    return f"{whole}.{nanoseconds:0>9}" if (whole + nanoseconds).isdecimal() else f"{whole} {nanoseconds}"
+
+
 def seconds(
     values: Sequence[str | int | float], what: str, *, unit: str = "auto", lines: Sequence[int] | None = None
 ) -> tuple[float, ...]:
