@@ -10,10 +10,12 @@ predicts.
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -30,8 +32,9 @@ from rille.datasets.manifest.model import Cameras, Images, Manifest
 from rille.datasets.manifest.rig import CAR, STREET, Optics, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import TABLE, read_bytes
+from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import NoParams
@@ -47,6 +50,9 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
 
+Reckoned = tuple[RigidTransform | None, ...] | None
+Used = TypeVar("Used")
+
 
 @dataclass(frozen=True)
 class TakenImage:
@@ -61,9 +67,10 @@ class TakenImage:
 def is_bag(path: Path) -> bool:
     """Whether a path is called as bags are."""
     about = path / "metadata.yaml"
-    return (path.is_file() and path.suffix in SUFFIXES) or (
-        about.is_file() and b"rosbag2_bagfile_information" in read_bytes(about, "bag's metadata", TABLE)
-    )
+    if not os.path.isfile(about):  # not pathlib's, which raises where a name is too long
+        return os.path.isfile(path) and path.suffix in SUFFIXES
+    with open_regular(about, "bag's metadata", sys.maxsize) as file:
+        return b"rosbag2_bagfile_information" in file.read(SMALL)
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:
@@ -171,10 +178,14 @@ def _stamp(message: Any) -> int:
 def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     """Images of a topic by their stamp, ns."""
     found: dict[int, TakenImage] = {}
+    number = 0
     for at, data, message in _messages(reader, topic):
-        stamp = _stamp(message)
+        number, stamp = number + 1, _stamp(message)
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
         found[stamp] = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
+    if number > 2 * len(found):  # of a driver that fills none in
+        text = f"{path}: {number} images of {topic} have {count(len(found), 'time stamp')} (header.stamp)"
+        raise InputError("RIL-939", text, remedy="record them with the times at which they were taken")
     return found
 
 
@@ -207,9 +218,8 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
             stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
             cameras = Cameras.model_validate({**stated, "names": beside.names})
             manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
-            line = warning(
-                "RIL-825", f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
-            )
+            text = f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
+            line = warning("RIL-825", text)
             optics = read_optics(manifest, path.parent, str(path), sizes)
             return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
     (left, turned), (right, _) = (_camera(reader, path, topic) for topic in topics)
@@ -256,48 +266,52 @@ def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.n
 
 def _movement(
     reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: np.ndarray
-) -> tuple[Inertial, tuple[RigidTransform | None, ...] | None, list[str]]:
+) -> tuple[Inertial, Reckoned, list[str]]:
     """What IMU and odometry say of each frame, and what cannot be used."""
     frames, warnings = _static(reader), list[str]()
     # frame_id names the camera as it is mounted; a rectified image is turned by R against it.
     T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
 
-    def placed(kind: str, place: Any) -> tuple[str, list[Any], RigidTransform] | None:
-        """The only topic of a kind with its messages, and the left image's pose in its frame."""
-        topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
-        if not topics:
-            return None
-        messages = [m for _, _, m in _messages(reader, topics[0])]
-        if len(topics) > 1 or not messages:
-            warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
-            return None
-        T_sensor_camera = _between(frames, place(messages[0]), frame)
-        if T_sensor_camera is None:
-            text = f"{path}: {FRAMES} does not say how {frame!r} stands in {place(messages[0])!r}: "
-            warnings.append(warning("RIL-951", f"{text}{topics[0]} is not used"))
-            return None
-        return topics[0], sorted(messages, key=_stamp), T_sensor_camera @ T_camera_image
+    def used(kind: str, place: Callable[[Any], str], use: Callable[..., Used], otherwise: Used) -> Used:
+        """What ``use`` makes of the only topic of a kind; ``otherwise`` where it cannot be used, which costs it alone.
 
-    inertial, odometry = Inertial(), None
-    found = placed(IMU, lambda m: m.header.frame_id)
-    if found is not None:
-        topic, messages, T_imu_left = found
+        ``use`` takes the topic's name, its messages with their times, and the left image's pose in its frame.
+        """
+        topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
+        # By stamp, for drivers repeat messages.
+        messages = {_stamp(m): m for topic in topics[:1] for _, _, m in _messages(reader, topic)}
+        if len(topics) > 1 or (topics and not messages):
+            warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
+        if len(topics) != 1 or not messages:
+            return otherwise
+        stamps = sorted(messages)
+        sensor = place(messages[stamps[0]])
+        T_sensor_camera = _between(frames, sensor, frame)
+        why = f"{FRAMES} does not say how {frame!r} stands in {sensor!r}"
+        try:
+            if T_sensor_camera is not None:
+                moments = seconds(stamps, f"{path} {topics[0]}", unit="ns")
+                return use(topics[0], moments, [messages[stamp] for stamp in stamps], T_sensor_camera @ T_camera_image)
+        except (InputError, ValueError) as error:  # ValueError: quaternions of zeros, forces that are no numbers
+            why = error.message if isinstance(error, InputError) else str(error)
+        warnings.append(warning("RIL-951", f"{path}: {topics[0]} is not used: {why}"))
+        return otherwise
+
+    def inertial(topic: str, moments: tuple[float, ...], messages: list[Any], T_imu_left: RigidTransform) -> Inertial:
         rates, forces = (
             np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in messages)])
             for name in ("angular_velocity", "linear_acceleration")
         )
-        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
-        record = ImuRecord(np.array(stamps), rates, forces, topic)
-        inertial = at_frames(record, times, T_imu_left)
-    found = placed(ODOMETRY, lambda m: m.child_frame_id)
-    if found is not None:
-        topic, messages, T_base_left = found
-        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
-        timed = TimedPoses(stamps, tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages), topic)
+        return at_frames(ImuRecord(np.array(moments), rates, forces, topic), times, T_imu_left)
+
+    def reckoned(topic: str, moments: tuple[float, ...], messages: list[Any], T_base_left: RigidTransform) -> Reckoned:
+        poses = tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages)
         # s; odometry is interpolated over no longer gap
-        between = interpolate(timed, times, 0.5)
-        odometry = tuple(None if T is None else T @ T_base_left for T in between)
-    return inertial, odometry, warnings
+        between = interpolate(TimedPoses(moments, poses, topic), times, 0.5)
+        return tuple(None if T is None else T @ T_base_left for T in between)
+
+    by_imu = used(IMU, lambda m: m.header.frame_id, inertial, Inertial())
+    return by_imu, used(ODOMETRY, lambda m: m.child_frame_id, reckoned, None), warnings
 
 
 def _static(reader: Any) -> dict[str, dict[str, RigidTransform]]:

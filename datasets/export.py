@@ -74,7 +74,9 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
             _write_image(folder, camera, sequence.frame_names[k], materialise(sequence.image(k, camera)))
     _write_rig(sequence, folder)
     if sequence.truth is not None:
-        _write_rows(folder / "poses.txt", [_numbers(sequence.truth[k]) for k in frames])
+        poses = (sequence.truth[k] for k in frames)
+        # Twelve numbers, rows of [R | t]; NaN for a gap.
+        _write_rows(folder / "poses.txt", [[math.nan] * 12 if pose is None else pose.to_list() for pose in poses])
     if sequence.times is not None:
         _write_rows(folder / "times.txt", [[sequence.times[k]] for k in frames])
     for frame in sorted({*pairs} - {*sequence.lost}):
@@ -83,17 +85,13 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
             _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
-    text = (
-        Path(__file__)
-        .with_name(README)
-        .read_text(encoding="utf-8")
-        .format(
-            name=sequence.name,
-            frames=len(frames),
-            size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
-            notes="\n".join(sequence.notes),
-            truth_source=sequence.truth_source or "no truth is known",
-        )
+    text = Path(__file__).with_name(README).read_text(encoding="utf-8")
+    text = text.format(
+        name=sequence.name,
+        frames=len(frames),
+        size=sizes[0] if sizes[0] == sizes[1] else f"left {sizes[0]}, right {sizes[1]}",
+        notes="\n".join(sequence.notes),
+        truth_source=sequence.truth_source or "no truth is known",
     )
     (folder / "README.txt").write_text(text, encoding="utf-8")
 
@@ -160,8 +158,3 @@ def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materi
     path.parent.mkdir(exist_ok=True)
     arrays: dict[str, Any] = {name: np.asarray(truth[name][:]) for name in ("elevation", "seen")}
     np.savez_compressed(path, T_truth_local=T_truth_local.matrix34, **arrays, **lattice)
-
-
-def _numbers(pose: RigidTransform | None) -> list[float]:
-    """Twelve numbers, rows of [R | t]; NaN for a gap."""
-    return [math.nan] * 12 if pose is None else pose.to_list()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,9 @@ class Georeference:
     crs: str
     origin: tuple[float, float, float]
     azimuth: float
+
+    def __post_init__(self) -> None:
+        _refuse_places(self.crs)
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -46,11 +50,18 @@ class Georeference:
         return Georeference(d["crs"], tuple(d["origin"]), d["azimuth"])
 
 
+def _refuse_places(crs: str) -> None:
+    """Refuse, by a ValueError, what GDAL would read a CRS from: a file, or a pipe, or an address in the net."""
+    if "://" in crs or crs.startswith("/") or os.path.exists(crs):
+        raise ValueError("it names a file or an address: give the CRS itself, e.g. EPSG:32633")
+
+
 def metric_crs(text: str) -> str:
     """The CRS as it is written; ValueError where it is unknown, not projected or not in metres."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 
+    _refuse_places(text)
     try:
         crs = CRS.from_user_input(text)
     except CRSError as error:

@@ -6,12 +6,14 @@ Forms of a file, one pose T_reference_body a row:
 * ``tum``: time, x y z, quaternion x y z w;
 * ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
-  ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``).
+  ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``);
+  of a robot on a plane ``x y`` and ``yaw`` or ``theta``.
 
 Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as the manifest
 states.
 
-Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Rows without position stand at 0.
+Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Coordinates and angles without a column
+are 0.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import seconds
+from rille.datasets.text.times import of_two, seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
@@ -42,12 +44,18 @@ WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
 WORDS = (
-    (re.compile(r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow"), lambda m: "time"),
+    (
+        re.compile(
+            r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
+        ),
+        lambda m: "time",
+    ),
     # Tools of ROS write the path of a field before its name.
     (re.compile(r"(.*[./])?(q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
+    (re.compile(r"theta"), lambda m: "yaw"),
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
     (re.compile(r"up|height|alt|altitude|elevation"), lambda m: "z"),
@@ -58,6 +66,9 @@ WORDS = (
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
 DEGREES = re.compile(r"\b(lat|lon)")
+
+NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
+"""Name of a column behind that of the whole seconds, as ROS stamps messages."""
 
 TIME_UNIT = re.compile(r"[\[(_ ](s|ms|us|ns)[\])]?$")
 """At the end of the name of a column of times."""
@@ -99,15 +110,15 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
         return TimedPoses(None, _matrices(table), table.name)
     columns = _columns(table, format, meant)
-    warnings: tuple[str, ...] = ()
+    warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
         # Trackers that have lost their target write zeros.
-        turned = np.asarray(table.values([columns[q] for q in QUATERNION if q in columns]).any(axis=1))
-        table, warnings = table.measured(list(columns.values()), ~turned if "qw" in columns else False)
+        lost = ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1) if quaternion else False
+        table, warnings = table.measured(list(columns.values()), np.asarray(lost))
     times = times_of(table, columns["time"]) if "time" in columns else None
-    rotations = _quaternions(table, columns) if "qw" in columns else _angles(table, columns)
-    placed = [columns[axis] for axis in POSITION if axis in columns]
-    positions = table.numbers(placed) if len(placed) == 3 else np.zeros((len(table.rows), 3))
+    rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
+    nothing = np.zeros((len(table.rows), 1))
+    positions = np.hstack([table.numbers([columns[axis]]) if axis in columns else nothing for axis in POSITION])
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
     return TimedPoses(times, poses, table.name, warnings)
 
@@ -151,8 +162,8 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
         if any(map(DEGREES.search, table.header)):
             remedy = "project latitude and longitude to metres, as UTM has them, in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
-    placed = [meant[axis] for axis in POSITION if axis in meant]
-    placed = [k for k in placed if not np.isnan(table.values([k])).all()] or placed
+    placed = [meant["x"], meant["y"]]
+    placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
     times, warnings = None, tuple[str, ...]()
     if "time" in meant:  # else rows are pairs
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
@@ -173,7 +184,10 @@ def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
     said = TIME_UNIT.search(table.header[column]) if table.header else None
-    return seconds(table.text(column), table.name, unit=said[1] if said else "auto", lines=table.lines)
+    stamps, unit = table.text(column), said[1] if said else "auto"
+    if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
+        stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
+    return seconds(stamps, table.name, unit=unit, lines=table.lines)
 
 
 def names_positions(table: TextTable) -> bool:
@@ -183,8 +197,9 @@ def names_positions(table: TextTable) -> bool:
 
 def _column(table: TextTable, stated: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
-    if isinstance(stated, str) and stated.strip().lower() in table.header:
-        return table.header.index(stated.strip().lower())
+    for names in (table.header, [name.partition(" [")[0] for name in table.header]):  # without its unit
+        if isinstance(stated, str) and stated.strip().lower() in names:
+            return names.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:
         return stated - 1
     text = f"{table.name}: columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
@@ -211,12 +226,12 @@ def _whole(columns: Mapping[str, int]) -> bool:
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
     """Columns of poses, by their names or in the order of the format."""
     if format in ("auto", "csv"):
-        if _whole(meant):
+        if _whole(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
             return meant
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
-            remedy = "add qw, qx, qy, qz or roll_deg, pitch_deg, yaw_deg; positions alone are [positions] or [truth]"
+            remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())
@@ -234,8 +249,10 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     """Rotation matrices (n, 3, 3) of roll, pitch and yaw, in the unit that the names say, or the figures alone."""
     from scipy.spatial.transform import Rotation
 
-    values = table.numbers([columns[a] for a in ANGLES])
-    units = {unit for a in ANGLES for unit in ("deg", "rad") if unit in table.header[columns[a]]}
+    known = [k for k, a in enumerate(ANGLES) if a in columns]
+    values = np.zeros((len(table.rows), 3))
+    values[:, known] = table.numbers([columns[ANGLES[k]] for k in known])
+    units = {unit for k in known for unit in ("deg", "rad") if unit in table.header[columns[ANGLES[k]]]}
     if not units and np.abs(values).max() > 2 * np.pi:
         units = {"deg"}
     if len(units) != 1:

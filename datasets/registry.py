@@ -170,7 +170,8 @@ def folder_manifest(folder: Path) -> Path | None:
     InputError
         There are several.
     """
-    found = sorted(folder.glob("*.rille.toml")) or [p for p in (folder / "manifest.toml",) if p.is_file()]
+    # None of the hidden ones that macOS adds to archives.
+    found = sorted(folder.glob("[!.]*.rille.toml")) or [p for p in (folder / "manifest.toml",) if p.is_file()]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         text = f"{folder} holds {len(found)} manifests: {names}"

@@ -90,7 +90,7 @@ def reconstruct(
 
     if not isinstance(seq, StereoSequence):
         check_place(seq)
-    opened = seq.source if isinstance(seq, StereoSequence) else None
+    opened, place = (seq.source, seq.place) if isinstance(seq, StereoSequence) else (str(seq), "")
     options = Options(
         assignments=tuple(assignments(settings)),
         frames=frames,
@@ -99,7 +99,7 @@ def reconstruct(
         cache=None if cache is None else str(cache),
         quiet=quiet,
     )
-    result = session.perform(str(seq) if opened is None else opened, options)
+    result = session.perform(opened, options, place=place)
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())

@@ -54,10 +54,12 @@ class StereoSequence:
 
     Attributes
     ----------
+    place : what it was opened by.
     drawn : images that were read or rendered already, by label.
     """
 
     source: Sequence
+    place: str = field(default="", compare=False)
     drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -161,7 +163,7 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     """
     check_place(path)
     check_sections(settings)
-    return StereoSequence(registry.open_sequence(str(path), settings))
+    return StereoSequence(registry.open_sequence(str(path), settings), str(path))
 
 
 def check_place(path: object) -> None:

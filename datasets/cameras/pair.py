@@ -23,9 +23,8 @@ def check_focal(camera: Camera, name: str) -> None:
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
         if not SHORTEST <= f / side <= LONGEST:
-            text = (
-                f"camera {name}: {what} = {f:g} px cannot be that of images of {camera.width} x {camera.height} pixels"
-            )
+            size = f"{camera.width} x {camera.height} pixels"
+            text = f"camera {name}: {what} = {f:g} px cannot be that of images of {size}"
             raise InputError("RIL-987", text, remedy="give fx and fy in pixels")
 
 

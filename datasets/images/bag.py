@@ -6,6 +6,7 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
-from rille.datasets.images.headers import Header
+from rille.datasets.images.headers import Header, read_header
 from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
@@ -72,7 +73,8 @@ def opened(path: Path) -> Iterator[Any]:
         text = f"{path}: bags are read by the package rosbags"
         raise InputError("RIL-940", text, remedy="pip install 'rille[robots]'") from error
     for file in path.iterdir() if path.is_dir() else (path,):
-        open_regular(file, "bag", sys.maxsize).close()
+        if not file.is_dir():
+            open_regular(file, "bag", sys.maxsize).close()
     try:
         # bags of ROS 2 before Iron hold no definitions of their messages
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
@@ -86,10 +88,9 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def depth(message: Any, name: str) -> Header:
-    """Width, height and bits of the image of a message."""
+    """Width, height and bits of the image of a message; one that is damaged further on costs its frame alone."""
     if hasattr(message, "format"):
-        found = files.decode(bytes(message.data), name)
-        return Header(found.shape[1], found.shape[0], found.dtype.itemsize * 8)
+        return files.usable(read_header(BytesIO(bytes(message.data))), name)
     return Header(int(message.width), int(message.height), _layout(message, name)[1])
 
 

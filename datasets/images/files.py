@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,6 +54,11 @@ ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
 
 _STDERR = threading.Lock()
 
+LIBJPEG = re.compile(
+    rb"(Corrupt JPEG|Premature end of|Inconsistent progression|Invalid SOS|Unknown Adobe|Warning: unknown JFIF).*\n?"
+)
+"""Warnings of libjpeg (its ``jerror.h``)."""
+
 COLOUR = Array(
     "colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of the left image", optional=True
 )
@@ -80,7 +85,8 @@ def _damaged(text: str) -> InputError:
 def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
     """Image of an encoded file as it is stored, None: it cannot be decoded; and what speaks against it, in words.
 
-    libjpeg tells of damage on the process's stderr alone, and gives some image all the same.
+    libjpeg tells of damage on the process's stderr alone, where other threads may write, too; and gives some image all
+    the same.
     """
     if not data.startswith(JPEG):
         return _decoded(data), ""
@@ -96,10 +102,13 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
             os.dup2(kept, 2)
             os.close(kept)
         aside.seek(0)
-        said = aside.read().decode(errors="replace").strip()
-    padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", said)
+        said = aside.read()
+    with suppress(OSError):
+        os.write(2, LIBJPEG.sub(b"", said))
+    complaints = "; ".join(match[0].decode(errors="replace").strip() for match in LIBJPEG.finditer(said))
+    padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", complaints)
     # Bytes before a JPEG's end marker that are no damage: webcams pad their images
-    return image, "" if padding and int(padding[1]) <= 16 else said
+    return image, "" if padding and int(padding[1]) <= 16 else complaints
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
@@ -111,9 +120,9 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
     except cv2.error:
         return None
     # But OpenCV turns a TIFF by its tag whatever it is asked for.
-    return (
-        image if image is None or not data.startswith(TIFF) else _turned_back(image, orientation(opened(BytesIO(data))))
-    )
+    if image is not None and data.startswith(TIFF):
+        return _turned_back(image, orientation(opened(BytesIO(data))))
+    return image
 
 
 def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:
@@ -158,7 +167,7 @@ def decode_colour(
     damage = _damage(data)
     if damage:
         raise _damaged(f"{name} {damage}")
-    header = _sound(read_header(BytesIO(data)), name)
+    header = usable(read_header(BytesIO(data)), name)
     if wanted is not None:
         check_size(header._replace(depth=wanted.depth), wanted, name)
     image, complaint = _unpacked(data)
@@ -186,7 +195,7 @@ def decode_colour(
     return grey, colour
 
 
-def _sound(header: Header | None, name: str) -> Header:
+def usable(header: Header | None, name: str) -> Header:
     """A header of an image that may be decoded."""
     if header is None:
         kind = kind_of(name)
@@ -239,7 +248,7 @@ def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
     refused |= unlike
     if 2 * count <= len(headers):
         raise next(iter((unlike or refused).values()))
-    _sound(wanted, str(next(path for path in paths if path not in refused)))
+    usable(wanted, str(next(path for path in paths if path not in refused)))
     return wanted, {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
 
 
@@ -279,11 +288,12 @@ class Digests:
     def __init__(self, memory: Path | None = None) -> None:
         self._memory = memory
         self._known: dict[str, str] = {}
-        if memory is not None and memory.is_file():
-            for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-                digest, _, key = line.partition(" ")
-                if len(digest) == 64:
-                    self._known[key] = digest
+        with suppress(OSError):  # that of a shared cache may be its owner's alone
+            if memory is not None and memory.is_file():
+                for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
+                    digest, _, key = line.partition(" ")
+                    if len(digest) == 64:
+                        self._known[key] = digest
 
     def whole(self, path: Path) -> bool:
         """Whether an image file may be taken; one that somebody still writes may not."""
@@ -302,14 +312,11 @@ class Digests:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
                 # Appended, not rewritten: two runs at once both keep what they found, and a torn line is passed over.
-                with suppress(OSError), _appended(self._memory) as file:
-                    file.write(f"{self._known[key]} {key}\n")
+                with suppress(OSError):
+                    self._memory.parent.mkdir(parents=True, exist_ok=True)
+                    with self._memory.open("a", encoding="utf-8", errors="surrogateescape") as memory:
+                        memory.write(f"{self._known[key]} {key}\n")
         return self._known[key]
-
-
-def _appended(path: Path) -> TextIO:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.open("a", encoding="utf-8", errors="surrogateescape")
 
 
 def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:

@@ -141,8 +141,14 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
 
 
 def in_order(stems: Sequence[str]) -> list[str]:
-    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order; those of
-    a counter that began anew from where it did not."""
+    """Names without their side from the first one taken to the last: see :func:`_ascending`, :func:`_begun_anew`."""
+    ordered = _ascending(stems)
+    first = _begun_anew(ordered)
+    return ordered[first:] + ordered[:first]
+
+
+def _ascending(stems: Sequence[str]) -> list[str]:
+    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order."""
     found = [DECIMAL.fullmatch(stem) for stem in stems]
     numbers = [match[2] for match in found if match]
     fractions = [number.partition(".")[2] for number in numbers]
@@ -151,9 +157,7 @@ def in_order(stems: Sequence[str]) -> list[str]:
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in stems]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
-    ordered = sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
-    first = _begun_anew(ordered)
-    return ordered[first:] + ordered[:first]
+    return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
 
 
 def _begun_anew(ordered: Sequence[str]) -> int:
@@ -240,7 +244,7 @@ def pair_up(
     """
     lines = [] if warnings is None else warnings
     left, right = (_sorted(paths, side) for side, paths in enumerate((left, right)))
-    if _begun_anew(sorted((path.stem for path in left), key=natural)):
+    if _begun_anew(_ascending([without_side(path.stem, 0) for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
     times = _times(left), _times(right)

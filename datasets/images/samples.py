@@ -45,8 +45,8 @@ def examined(sequence: Sequence) -> Sequence:
     orientations: dict[str, set[int]] = {camera: set() for camera in CAMERAS}
     for camera, source in ((camera, source) for camera, of in sources.items() for source in of):
         turned, several = _tags(source)
-        if several > 1:  # as stacks, and both views of a stereo camera
-            text = f"{source.hints['path']} holds {several} images, and one is read of each file"
+        if several:  # as stacks, and both views of a stereo camera
+            text = f"{source.hints['path']} holds several images, and one is read of each file"
             raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
         orientations[camera].add(turned)
     lines = _orientations(*orientations.values())
@@ -77,21 +77,19 @@ def _images(source: Source) -> list[AnyArray]:
     return []
 
 
-def _tags(source: Source) -> tuple[int, int]:
-    """EXIF's orientation of an image file, and how many images of the size of the first one it holds, apart from masks;
-    1 where it cannot be read."""
-    turned = several = 1
+def _tags(source: Source) -> tuple[int, bool]:
+    """EXIF's orientation of an image file, 1 where it cannot be read; whether it has a second image that is no mask or
+    smaller copy of the first."""
+    turned, several = 1, False
     with (
         catch_warnings(action="ignore"),
-        suppress(Exception),  # of a damaged directory: whatever the parsers come upon
+        suppress(Exception),  # of a damaged directory: whatever the parsers come upon; there is no second image
         Image.open(source.hints["path"], formats=FORMATS) as image,
     ):
-        turned, size, count = orientation(image), image.size, getattr(image, "n_frames", 1)
-        if count > 1:
-            image.seek(1)
+        turned, size = orientation(image), image.size
+        image.seek(1)
         # TIFF's tag of images that are a smaller copy, or a mask, of another one
-        if image.size == size and not getattr(image, "tag_v2", {}).get(254, 0):
-            several = count
+        several = image.size == size and not getattr(image, "tag_v2", {}).get(254, 0)
     return turned, several
 
 
@@ -120,10 +118,8 @@ def _orientations(left: set[int], right: set[int]) -> list[str]:
         return []
     words = f"EXIF orientations are {sorted(left)} of left images and {sorted(right)} of right ones"
     if left != right or len(left) > 1:
-        remedy = (
-            "turn the pixels (magick mogrify -auto-orient FILES), or remove the tags (exiftool -Orientation= FILES)"
-        )
-        raise InputError("RIL-828", f"{words}: which pixels are those of the calibration is not known", remedy=remedy)
-    return [
-        warning("RIL-829", f"{words}: they are ignored, the calibration is taken for the pixels as they are stored")
-    ]
+        text = f"{words}: which pixels are those of the calibration is not known"
+        remedy = "turn the pixels (magick mogrify -auto-orient FILES), or remove the tags: exiftool -Orientation= FILES"
+        raise InputError("RIL-828", text, remedy=remedy)
+    text = f"{words}: they are ignored, the calibration is taken for the pixels as they are stored"
+    return [warning("RIL-829", text)]

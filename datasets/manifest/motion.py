@@ -21,12 +21,15 @@ from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, split
-from rille.datasets.text.times import seconds, undated
+from rille.datasets.text.times import of_two, seconds, undated
 from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
 Row = TypeVar("Row")
+
+TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
+"""Seconds since 1970 and nanoseconds; where the second is a number of frames, a time changes by nothing that counts."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
@@ -137,6 +140,8 @@ class MotionReader:
             at.append(k)
             images = images or bool(names)
             by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(at) - 1 for cell in names or cells[1:2]}
+        if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells in found):
+            found = [[of_two(*cells)] for cells in found]
         column = int(_counts(found))
         rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
         # Tables may list more images than there are pairs, in any order: names decide where all are found.

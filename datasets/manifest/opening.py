@@ -175,18 +175,14 @@ def root_folder(text: str, path: Path) -> Path:
 
     def value(match: re.Match[str]) -> str:
         if not os.environ.get(match[1]):
-            raise InputError(
-                "RIL-214",
-                f"{path}: root = {text!r} needs the environment variable {match[1]}, which is not set",
-                remedy=f"export {match[1]}=FOLDER",
-            )
+            words = f"{path}: root = {text!r} needs the environment variable {match[1]}, which is not set"
+            raise InputError("RIL-214", words, remedy=f"export {match[1]}=FOLDER")
         return os.environ[match[1]]
 
     root = path.resolve().parent / os.path.expanduser(VARIABLE.sub(value, text))
     if not os.path.isdir(root):
-        raise InputError(
-            "RIL-215", f"{path}: root = {text!r}: there is no folder {root}", remedy="correct root, or its variable"
-        )
+        words = f"{path}: root = {text!r}: there is no folder {root}"
+        raise InputError("RIL-215", words, remedy="correct root, or its variable")
     return root
 
 

@@ -1,8 +1,8 @@
 """Tables of numbers in text files, as sensors and other programs write them: cells as text, lines remembered.
 
 Columns are parted by commas, semicolons, tabs or blanks. The last line of words before the first row names the columns,
-with or without a leading ``#`` or ``%``; later comments are passed over. A date and time of day at the beginning of a
-row is a number of seconds. A cell may be empty, which is no number.
+with or without a leading ``#`` or ``%``, and one of units below it their units; later comments are passed over. A date
+and time of day at the beginning of a row is a number of seconds. A cell may be empty, which is no number.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
+UNITS = frozenset(("", "s", "ms", "us", "ns", "sec", "m", "mm", "cm", "km", "rad", "deg", "dps", "g", "px", "%"))
+OPERATOR = re.compile(r"[-/^*.\d \[\]()]+")
+"""Words of a row of units, and what stands between and about them: ``[m s^-2]``."""
+
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 
@@ -103,7 +107,7 @@ def read_table(path: Path, what: str) -> TextTable:
         It cannot be read, has no rows, or rows differ in length.
     """
     lines = read_lines(path, what)
-    names, separator, columns = "", None, 0
+    names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
     for k, line in enumerate(lines, start=1):
@@ -117,7 +121,10 @@ def read_table(path: Path, what: str) -> TextTable:
             columns = len(split(names, separator or ("\t" if "\t" in names else None)))
         row = split(text, separator, columns)
         if not rows and not NUMBER.match(row[0]):
-            names = text.lstrip("#%").strip()
+            text = text.lstrip("#%").strip()
+            cells = split(text, separator, columns)
+            of_units = bool(names) and all(UNITS.issuperset(OPERATOR.split(cell.lower())) for cell in cells)
+            names, units = (names, cells) if of_units else (text, ())
             continue
         if rows and len(row) != columns:
             text = f"{path}, line {k}: {len(row)} columns where the first row has {columns}"
@@ -129,6 +136,8 @@ def read_table(path: Path, what: str) -> TextTable:
         raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
     header = split(names, separator, columns)
     header = header if len(header) == columns else ()
+    if len(units) == columns:
+        header = tuple(f"{n} [{u.strip('[]()')}]" if u else n for n, u in zip(header, units, strict=False))
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
 
 

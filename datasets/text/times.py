@@ -42,6 +42,11 @@ def undated(text: str) -> str:
     return DATE.sub(since, text)
 
 
+def of_two(whole: str, nanoseconds: str) -> str:
+    """Seconds of a stamp in two cells, as ROS has them; no number where they are none."""
+    return f"{whole}.{nanoseconds:0>9}" if (whole + nanoseconds).isdecimal() else f"{whole} {nanoseconds}"
+
+
 def seconds(
     values: Sequence[str | int | float], what: str, *, unit: str = "auto", lines: Sequence[int] | None = None
 ) -> tuple[float, ...]:
@@ -69,23 +74,20 @@ def seconds(
     exact = [_decimal(v, what, k) for v, k in zip(values, at, strict=True)]
     if not exact:
         return ()
-    in_order = zip(at[1:], exact, exact[1:], strict=False)
     stated = unit if unit != "auto" else _unit(exact, what, at)
-    for line, before, now in in_order:
-        if now <= before:
-            words = "is there twice" if now == before else f"goes back from {before}"
-            text = f"{what}, line {line}: time {now} {words}"
-            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     times = tuple(float(v / UNITS[stated]) for v in exact)
+    for k in range(1, len(times)):
+        if times[k] <= times[k - 1]:
+            words = "is there twice" if times[k] == times[k - 1] else f"goes back from {exact[k - 1]}"
+            text = f"{what}, line {at[k]}: time {exact[k]} {words}"
+            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
     # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
     # likelier, and no camera takes ten million images a second.
     if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
         text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
         likely = "ns" if usual > 1.0 else "s"
-        remedy = (
-            f'state their unit: times.unit = "{likely}" in the manifest, or time_{likely} as the name of the column'
-        )
+        remedy = f'state their unit: times.unit = "{likely}" in the manifest, or name the column time_{likely}'
         raise InputError("RIL-687", text, remedy=remedy)
     return times
 
@@ -102,13 +104,9 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
     return exact
 
 
-def _magnitude(value: Decimal) -> str:
-    return next((unit for unit, upper in UPPER.items() if abs(value) < upper), "ns")
-
-
 def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
     """The unit that all stamps have by their magnitude."""
-    units = [_magnitude(v) for v in exact]
+    units = [next((unit for unit, upper in UPPER.items() if abs(v) < upper), "ns") for v in exact]
     for k, unit in enumerate(units):
         if unit != units[0]:
             text = f"{what}, line {lines[k]}: time {exact[k]} after {exact[k - 1]}: mixed units ({units[0]} and {unit})"

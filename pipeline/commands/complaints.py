@@ -23,7 +23,7 @@ def complain(error: Exception, *, debug: bool = False) -> int:
     else:
         hint = "" if debug else " (run again with --debug for the traceback)"
         print_error("RIL-999", f"{type(error).__name__}: {error}{hint}")
-    return USAGE if isinstance(error, ConfigError | InputError) else FAILED
+    return USAGE if isinstance(known, ConfigError | InputError) else FAILED
 
 
 def print_error(code: str, words: str) -> None:

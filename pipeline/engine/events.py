@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.graph import Handle
+from rille.pipeline.engine.runtime.atomic import named
 from rille.pipeline.engine.spec import each
 
 
@@ -49,7 +51,8 @@ class Ledger:
         self._line({"run": facts})
 
     def _line(self, row: dict[str, Any]) -> None:
-        self._file.write(json.dumps(row) + "\n")
+        with named(Path(self._file.name)):
+            self._file.write(json.dumps(row) + "\n")
 
     def close(self) -> None:
         """Close the file."""
@@ -92,10 +95,9 @@ def _lines(path: Path) -> list[dict[str, Any]]:
     with path.open("rb") as file:
         # Bytes of a line; one that reads a million artifacts has less. A file of holes is one line without an end.
         while line := file.readline(100_000_000):
-            try:
+            # The last one may be cut short by a crash; where another is damaged, those behind it count.
+            with suppress(ValueError, RecursionError):
                 rows.append(json.loads(line.decode()))
-            except (ValueError, RecursionError):
-                break
     return rows
 
 

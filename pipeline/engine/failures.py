@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from rille.stages.core.errors import RilleError
+from rille.stages.core.errors import ConfigError, RilleError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -19,7 +19,8 @@ def translated(error: BaseException) -> RilleError | None:
         return RilleError("RIL-736", "memory is used up", remedy=remedy)
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
-        return RilleError("RIL-737", f"{where}{error.strerror}", remedy=_remedy(error.errno))
+        kind = ConfigError if error.errno == errno.ENAMETOOLONG else RilleError
+        return kind("RIL-737", f"{where}{error.strerror}", remedy=_remedy(error.errno))
     library = type(error).__module__.split(".")[0]
     if library == "cv2":
         return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")
@@ -33,4 +34,6 @@ def _remedy(number: int) -> str:
         return "free space, clear the cache, or choose another place with --output, --runs or --cache"
     if number in CLOSED:
         return "choose a place that may be written with --output, --runs or --cache"
+    if number == errno.ENAMETOOLONG:
+        return "give a shorter name"
     return "check the path; the same command resumes from here"

@@ -40,9 +40,8 @@ def parse(text: str) -> int:
         amount = float(given[:-1]) / 100 * total() if share else parse_bytes(given)
         if given[:1].isdecimal() and 0 < amount <= (total() if share else math.inf):
             return int(amount)
-    raise ConfigError(
-        "RIL-553", f"--memory-limit {text!r} is no amount of memory", remedy="give e.g. 6GB, 800MB or 75%"
-    )
+    shown = f"--memory-limit {text!r} is no amount of memory"
+    raise ConfigError("RIL-553", shown, remedy="give e.g. 6GB, 800MB or 75%")
 
 
 def words(amount: float) -> str:

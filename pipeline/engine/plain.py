@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from io import TextIOWrapper
 from typing import Any, TextIO
 
 UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -72,5 +73,7 @@ def plain_output() -> Iterator[None]:
 
 
 def _open(stream: TextIO | None) -> TextIO:
-    """The stream, or one that leads nowhere: a shell's ``>&-`` leaves none."""
+    """The stream, which has a form for every letter; or one that leads nowhere: a shell's ``>&-`` leaves none."""
+    if isinstance(stream, TextIOWrapper):
+        stream.reconfigure(errors="backslashreplace")
     return open(os.devnull, "w", encoding="utf-8") if stream is None else stream

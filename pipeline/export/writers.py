@@ -141,7 +141,7 @@ def write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning,
             if meaning.colours:
                 file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
             file.units = tuple("metre" if u == "m" else u for u in meaning.units(bands))
-            file.update_tags(**{key.upper(): value for key, value in meaning.tags.items()})
+            file.update_tags(**{key.upper(): plain(value) for key, value in meaning.tags.items()})
         # The driver COG writes as it closes.
         atomic.write(path, bytes(memory.getbuffer()))
 

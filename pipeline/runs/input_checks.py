@@ -79,12 +79,8 @@ LIMITS = {
         # A white sky takes less than this; more means clipped ground.
         InputLimit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
         # The matcher removes the mean, but not the noise.
-        InputLimit(
-            "RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix the exposure"
-        ),
-        InputLimit(
-            "RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and bit depth"
-        ),
+        InputLimit("RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix exposure"),
+        InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and depth"),
     ),
     "sharpness": (
         InputLimit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
@@ -104,9 +100,7 @@ LIMITS = {
     ),
     "sides": (
         Fault("RIL-659", "beyond", most=0.5, remedy="left and right are swapped, or the baseline has the wrong sign"),
-        InputLimit(
-            "RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in, or its principal points, are wrong"
-        ),
+        InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),

@@ -166,8 +166,8 @@ def output_file(output: Path, ending: str) -> Path:
     ConfigError
         It has no name, as ``.`` has none.
     """
-    if not output.name:
-        raise ConfigError("RIL-969", f"the output {output} is a folder", remedy="name the files in it, without ending")
+    if not output.name:  # as "." has none
+        check_output(output)
     return output.with_name(re.sub(r"\.(gpkg|json|tif|tum)$", "", output.name) + ending)
 
 

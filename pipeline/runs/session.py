@@ -20,12 +20,14 @@ from typing import TYPE_CHECKING, Any
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
+from rille.datasets.text.warning import warning
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
 from rille.pipeline.export.view import UNSTATED, RunView
@@ -177,6 +179,7 @@ def perform(
     options: Options,
     *,
     verb: str = "reconstruct",
+    place: str = "",
     kept: list[Workers] | None = None,
     warn: Callable[[str], None] = warn,
 ) -> RunResult:
@@ -186,12 +189,13 @@ def perform(
     ----------
     sequence : its name or path, or itself, where it is open already.
     verb : command that asks for the run.
+    place : of a sequence that is open already: the name or path that it was opened by.
     kept : list of the workers that a run leaves to the next one; whoever gives it ends them.
     warn : takes warnings, one line each: those of the input before anything is computed.
     """
     from rille.pipeline.runs import run_files  # imports matplotlib, which a wrong option should not have to wait for
 
-    opened = _open(sequence, options, verb, warn)
+    opened = _open(sequence, options, verb, place, warn)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
     result = _compute(opened, kept)
@@ -232,21 +236,21 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
     return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
 
 
-def _open(name: str | Sequence, options: Options, verb: str, warn: Callable[[str], None]) -> _Opened:
+def _open(name: str | Sequence, options: Options, verb: str, place: str, warn: Callable[[str], None]) -> _Opened:
     """Read the input and lay the run out."""
     started = datetime.now(UTC)
     settled = settings_of_run(name, options, warn)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
     if verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
-    command = options.command(verb, name if isinstance(name, str) else name.name)
+    command = options.command(verb, name if isinstance(name, str) else place or name.name)
     header = f"# {command}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
     text = header + configuration.to_toml(config, sequence.parameters)
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
     # After the layout, which refuses what does not fit: then no folder is left behind.
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
-    (folder / "config.toml").write_text(text, encoding="utf-8")
+    atomic.write(folder / "config.toml", text)
     view = RunView(
         run_id=folder.name,
         sequence=sequence,
@@ -335,9 +339,9 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
         try:
             folder.mkdir(parents=True)
             break
-        except FileExistsError:
-            continue
         except OSError as error:
+            if folder.is_dir():
+                continue
             text = f"cannot make {folder}: {error.strerror}"
             raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
@@ -347,5 +351,9 @@ def _point_latest(folder: Path) -> None:
     """Move ``latest`` to a finished run in one step."""
     # symlink_to cannot replace a link; a rename can, in one step, so a reader finds the earlier or the new run.
     link = folder.parent / f".latest-{uuid.uuid4().hex}"
-    link.symlink_to(folder.name, target_is_directory=True)
-    link.replace(folder.parent / "latest")
+    try:
+        link.symlink_to(folder.name, target_is_directory=True)
+        link.replace(folder.parent / "latest")
+    except OSError as error:  # of a file system without links; the results are whole
+        text = f"{folder.parent / 'latest'} does not lead to this run: {error.strerror}; name it as {folder.name}"
+        warn(warning("RIL-741", text))

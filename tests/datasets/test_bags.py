@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import rille
+from rille.datasets.bags import is_bag
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
 from rille.stages.core.declare import declared
@@ -123,9 +124,19 @@ def pixels(sequence, frame, camera):
     return np.asarray(run(sequence.image(frame, camera))["image"])
 
 
+def test_a_large_file_that_is_called_as_a_bags_makes_no_bag(tmp_path):
+    with (tmp_path / "metadata.yaml").open("wb") as file:
+        file.truncate(200_000_000)
+    assert not is_bag(tmp_path)
+    assert not is_bag(tmp_path / ("x" * 300))
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_rectified_pairs_come_back_as_they_were_written(tmp_path, form):
-    sequence = open_sequence(str(street(form).write(tmp_path)))
+    path = street(form).write(tmp_path)
+    if path.is_dir():
+        (path / "notes").mkdir()
+    sequence = open_sequence(str(path))
     assert sequence.frames == 3
     assert sequence.times == pytest.approx([1.7e9, 1.7e9 + 0.1, 1.7e9 + 0.2])
     assert sequence.rig.baseline == pytest.approx(0.5)
@@ -213,6 +224,13 @@ def test_imu_and_odometry_count_where_tf_static_places_them(tmp_path):
     assert sequence.odometry[2].translation == pytest.approx([0.2 + 0.4, 0.1, 0.8])
     assert sequence.odometry[2].rotation == pytest.approx(T_base_camera.rotation)
     assert sequence.attitude[0] is not None
+    # Drivers repeat messages, and odometry may begin without a rotation: that costs no more than the sensor.
+    bag.rows += [row for row in bag.rows if row[0] == "/imu"]
+    first = next(m for topic, _, m in bag.rows if topic == "/odom")
+    first.pose.pose.orientation = bag.vector([0, 0, 0, 0], "geometry_msgs/msg/Quaternion")
+    partly = open_sequence(str(bag.write(tmp_path / "partly")))
+    assert (partly.attitude, partly.odometry) == (sequence.attitude, None)
+    assert [line for line in partly.warnings if "/odom" in line and "RIL-951" in line]
     lone = street(frames=2)
     lone.add("/imu", START, next(m for topic, _, m in bag.rows if topic == "/imu"))
     assert any("RIL-951" in line for line in open_sequence(str(lone.write(tmp_path / "lone"))).warnings)
@@ -266,6 +284,30 @@ def test_a_short_image_and_a_changed_bag_are_refused(tmp_path):
     path.write_bytes(street(frames=1).write(tmp_path / "other").read_bytes())
     with raises("RIL-944"):
         pixels(sequence, 2, "left")
+
+
+def test_a_compressed_image_that_breaks_off_costs_its_frame_alone(tmp_path):
+    bag = street(frames=0)
+    for k in range(3):
+        for side, topic in enumerate((LEFT, RIGHT)):
+            data = cv2.imencode(".jpg", picture(k, side))[1].tobytes()
+            bag.compressed(f"{topic}/compressed", START + k * STEP, data[: len(data) // 2] if k == 1 else data)
+    sequence = open_sequence(str(bag.write(tmp_path)))
+    assert sequence.frames == 3
+    damaged = run(sequence.image(1, "left"))
+    assert "decoded" in damaged.meta["damage"]
+    assert not damaged["valid"].any()
+    assert "damage" not in run(sequence.image(2, "left")).meta
+
+
+def test_images_without_time_stamps_are_refused(tmp_path):
+    """All of them but one would be left out."""
+    bag = street(frames=3)
+    for topic, _, message in bag.rows:
+        if topic in (LEFT, RIGHT):
+            message.header = bag.header(0)
+    with raises("RIL-939", LEFT, "3 images", "1 time stamp"):
+        open_sequence(str(bag.write(tmp_path)))
 
 
 def test_images_without_a_partner_are_left_out(tmp_path):

@@ -117,6 +117,25 @@ def test_a_jpeg_that_libjpeg_complains_about_is_refused(capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_what_other_threads_say_meanwhile_is_no_damage_and_is_not_lost(capfd, monkeypatch):
+    real = files._decoded
+
+    def meanwhile(data):
+        os.write(2, b"no line feed, ")
+        image = real(data)
+        os.write(2, b"a warning\n")
+        return image
+
+    monkeypatch.setattr(files, "_decoded", meanwhile)
+    data = photograph()
+    files.decode(bytes(data), "x")
+    assert capfd.readouterr().err == "no line feed, a warning\n"
+    data[len(data) // 2 : len(data) // 2 + 200] = bytes(200)
+    with raises("RIL-192", "Corrupt JPEG data"):
+        files.decode(bytes(data), "x")
+    assert capfd.readouterr().err == "no line feed, a warning\n"
+
+
 def test_a_few_bytes_of_padding_before_the_end_are_no_damage(capfd):
     data = photograph()
     padded = bytes(data[:-2]) + bytes([7, 7, 7]) + b"\xff\xd9"
@@ -217,3 +236,10 @@ def test_a_memo_that_cannot_be_written_is_left_out(tmp_path, grey):
     first = Digests(tmp_path / "file" / "digests").sha256(path)
     for _ in range(2):
         assert Digests(tmp_path / "digests").sha256(path) == first
+
+
+def test_a_memo_that_cannot_be_read_is_left_out(tmp_path, grey):
+    path = tmp_path / "a.png"
+    path.write_bytes(encoded(grey))
+    (tmp_path / "digests").symlink_to("/proc/self/mem")  # a regular file whose first byte cannot be read
+    assert Digests(tmp_path / "digests").sha256(path) == Digests().sha256(path)

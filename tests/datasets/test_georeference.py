@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 from raising import raises
 
+from rille.datasets.georeference import Georeference
 from rille.datasets.manifest.model import World
 from rille.datasets.text.validation import validated
 
@@ -34,8 +37,19 @@ def test_axes_by_hand() -> None:
         ({"crs": "EPSG:999999"}, ("crs", "no known")),
         ({"crs": "EPSG:4326"}, ("crs", "projected")),
         ({"crs": "EPSG:2263"}, ("crs", "0.3048")),
+        ({"crs": "http://127.0.0.1:1/crs"}, ("crs", "address")),
+        ({"crs": "/vsistdin/"}, ("crs", "file")),
     ],
 )
 def test_what_is_refused(given: dict[str, object], facts: tuple[str, ...]) -> None:
     with raises("RIL-223", "m.toml", *facts):
         validated("RIL-223", World, given, file="m.toml")
+
+
+def test_no_file_is_opened_for_a_crs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "EPSG")
+    monkeypatch.chdir(tmp_path)
+    with raises("RIL-223", "file"):
+        validated("RIL-223", World, {"crs": "EPSG"}, file="m.toml")
+    with pytest.raises(ValueError, match="file"):  # as a run's folder of somebody else's may state it
+        Georeference.from_dict({"crs": str(tmp_path / "EPSG"), "origin": ORIGIN, "azimuth": 0.0})

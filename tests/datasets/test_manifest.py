@@ -294,6 +294,13 @@ def test_seconds_that_count_stay_times(tmp_path, lines):
     assert opened(path).times == (0.0, 1.0, 2.0)
 
 
+def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    for head in ([], ["# secs nsecs"]):
+        write_lines(tmp_path / "t.txt", [*head, "1400000000 900000000", "1400000002 0", "1400000003 100000000"])
+        assert opened(path).times == pytest.approx((1400000000.9, 1400000002.0, 1400000003.1), abs=1e-6)
+
+
 def test_a_table_of_other_images_is_refused(tmp_path):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", ["0.0 07.png", "0.5 08.png", "1.0 09.png"])

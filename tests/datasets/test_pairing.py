@@ -281,6 +281,13 @@ def test_a_counter_that_began_anew_goes_on_where_it_ended():
     ]
 
 
+def test_a_counter_before_the_cameras_number_is_said_to_have_begun_anew():
+    numbers, lines = [*range(995, 1000), *range(5)], []
+    left, right = (paths(*(f"{k:03d}_cam{side}.png" for k in sorted(numbers))) for side in (0, 1))
+    assert [pair.name for pair in pair_up(left, right, warnings=lines)] == [f"{k:03d}" for k in numbers]
+    assert lines[0].startswith("RIL-707: ")
+
+
 @pytest.mark.parametrize("numbers", [range(1000), [*range(400), *range(600, 1000)], [0, 1, 2], [0, 1, 998]])
 def test_numbers_from_the_least_to_the_greatest_are_no_counter_that_began_anew(numbers):
     names, lines = [f"{k:03d}.png" for k in numbers], []

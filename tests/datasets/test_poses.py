@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses
+from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses, read_positions
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -188,3 +188,44 @@ def test_positions_alone_are_said_to_lack_a_rotation(tmp_path, header):
     rows = "\n".join(",".join(str(k + j) for j in range(header.count(",") + 1)) for k in range(3))
     with raises("RIL-801", "qw", *header.split(",")[1:3]):
         read(tmp_path, f"{header}\n{rows}\n")
+
+
+def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_path):
+    rows = "1,0,0,0,0.1,0.2,0.3,0.927\n2,0,0,0,0.1,0.2,0.3,0.927\n"
+    plain, with_units = (read(tmp_path, f"time,x,y,z,qx,qy,qz,qw\n{units}{rows}") for units in ("", "s,m,m,m,,,,\n"))
+    np.testing.assert_array_equal(plain.poses[0].rotation, with_units.poses[0].rotation)
+
+
+@pytest.mark.parametrize("names", ["secs,nsecs", "field.header.stamp.sec,field.header.stamp.nanosec"])
+def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path, names):
+    (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,100000000,1,2\n1400000001,9000,1,3\n")
+    found = read_positions(tmp_path / "p.csv", "auto", {"time": names.partition(",")[0]})
+    assert found is not None
+    assert found.times == pytest.approx((1400000000.1, 1400000001.000009), abs=1e-6)
+    assert read_positions(tmp_path / "p.csv", "auto", {}) == found
+    (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,1e8,1,2\n")
+    with raises("RIL-291", "line 2", "1e8"):
+        read_positions(tmp_path / "p.csv", "auto", {})
+
+
+@pytest.mark.parametrize("header", ["time,x,y,yaw_deg", "time,x,y,theta [deg]", "time,x,y,qx,qy,qz,qw"])
+def test_a_robot_on_a_plane_has_neither_height_nor_tilt(tmp_path, header):
+    turn = "0,0,0.7071068,0.7071068" if "qw" in header else "90"
+    found = read(tmp_path, f"{header}\n1,2,3,{turn}\n2,3,3,{turn}\n")
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-6)
+    np.testing.assert_array_equal([pose.translation for pose in found.poses], [[2, 3, 0], [3, 3, 0]])
+
+
+def test_a_part_of_a_quaternion_beside_angles_is_none(tmp_path):
+    found = read(tmp_path, "time,qw,roll_deg,pitch_deg,yaw_deg\n1,7,0,0,90\n2,7,0,0,90\n")
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
+
+
+def test_positions_without_a_measured_coordinate_are_refused_and_without_heights_have_none(tmp_path):
+    for text, row in (("time,x,y\n1,,2\n2,,3\n", "line 2"), ("time,x,y,z\n1,2,3,\n2,4,5,\n", "")):
+        (tmp_path / "p.csv").write_text(text)
+        if row:
+            with raises("RIL-284", row):
+                read_positions(tmp_path / "p.csv", "auto", {})
+        else:
+            assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))

@@ -106,8 +106,10 @@ def test_a_manifest_or_the_folder_that_holds_it(tmp_path):
     assert open_sequence(str(upper)).frames == 3
     upper.rename(path.parent / "manifest.toml")
     assert open_sequence(str(path.parent)).frames == 3
-    for name in ("a", "b"):
-        (path.parent / f"{name}.rille.toml").write_text("")
+    for name in ("._a", "a", "b"):
+        (path.parent / f"{name}.rille.toml").write_bytes((path.parent / "manifest.toml").read_bytes())
+        if name == "a":  # beside it what macOS adds to archives
+            assert open_sequence(str(path.parent)).frames == 3
     with raises("RIL-279", "a.rille.toml", "b.rille.toml"):
         open_sequence(str(path.parent))
 

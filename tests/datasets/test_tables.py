@@ -89,3 +89,13 @@ def test_a_missing_or_binary_file(tmp_path):
     (tmp_path / "b.csv").write_bytes(b"\xff\x00\x80")
     with raises("RIL-140"):
         read_table(tmp_path / "b.csv", "table")
+
+
+@pytest.mark.parametrize("units", ["s,m,[m s^-2],", "# s, m, (m s-2),"])
+def test_a_row_of_units_below_the_names_is_theirs(tmp_path, units):
+    names = table(tmp_path, f"time,x,ax,n\n{units}\n1,2,3,4\n").header
+    assert (*names[:2], names[2][:6], names[3]) == ("time [s]", "x [m]", "ax [m ", "n")
+
+
+def test_words_below_the_names_that_are_no_units_are_the_names(tmp_path):
+    assert table(tmp_path, "a,b\nm,x\n1,2\n").header == ("m", "x")

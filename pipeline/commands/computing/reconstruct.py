@@ -39,7 +39,7 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = _OPTIONS) ->
 
 def _perform(seq: str, options: Options) -> tuple[int, Path]:
     """Run a sequence, or the run of a crate anew; the exit code and the folder of the results."""
-    crate = rocrate.read(Path(seq)) if rocrate.describes_run(Path(seq)) else None
+    crate = rocrate.read(Path(seq))
     if crate is not None:
         frames = crate.options.get("--frames", (None,))[-1]
         options = replace(

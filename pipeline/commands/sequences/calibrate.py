@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.reading import read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_output
+from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_new, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
@@ -44,6 +45,9 @@ MAX_FOCAL_SIGMA = 0.01
 MIN_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
+
+OURS = "x_right = R x_left + T, metres; board in inner corners, square in metres, residuals in pixels RMS"
+"""Comment in the files that are written."""
 
 Image = NDArray[Any]
 
@@ -104,6 +108,8 @@ def calibrate(
         Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
+    if output.exists() and OURS not in read_text(output, "calibration"):
+        check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
     boards = find_boards(pairing.pair_up(*_files(left, right)), given)
@@ -134,8 +140,9 @@ def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
 
 def _images(place: Path) -> list[Path]:
     """Image files of a folder, a glob or a single path."""
-    every = list(place.iterdir()) if place.is_dir() else [Path(p) for p in glob.glob(str(place.expanduser()))]
-    images = sorted(path for path in every if path.suffix.lower() in SUFFIXES)
+    # glob passes over hidden files, which macOS adds to archives.
+    pattern = f"{glob.escape(str(place))}/*" if place.is_dir() else str(place.expanduser())
+    images = sorted(Path(path) for path in glob.glob(pattern) if path.lower().endswith(SUFFIXES))
     if not images:
         remedy = "give a folder, or a glob in quotes such as 'left*.jpg'"
         raise InputError("RIL-011", f"{place} names no images", remedy=remedy)
@@ -267,9 +274,7 @@ def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
     content["standard_deviations"] = {name.replace(" ", "_"): value for name, value in rig.sigma.items()}
     # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    file.writeComment(
-        "x_right = R x_left + T, metres; board in inner corners, square in metres, residuals in pixels RMS"
-    )
+    file.writeComment(OURS)
     _store(file, content)
     return str(file.releaseAndGetString())
 

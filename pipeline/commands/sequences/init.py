@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rille.datasets.bags import is_bag
+from rille.datasets.images.pairing import writable
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
@@ -66,7 +67,10 @@ def _root(directory: Path, path: Path) -> str:
     """The folder as seen from the manifest: relative where the manifest lies in or beside it."""
     relative = os.path.relpath(directory.resolve(), path.resolve().parent)
     # Two folders up and more, a relative path breaks as soon as either is moved.
-    return str(directory.resolve()) if relative.startswith(os.path.join("..", "..")) else Path(relative).as_posix()
+    far = relative.startswith(os.path.join("..", ".."))
+    root = str(directory.resolve()) if far else Path(relative).as_posix()
+    writable(" ".join(root.splitlines()))  # of line breaks TOML has a form
+    return root
 
 
 def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:

@@ -34,7 +34,7 @@ def replacing(path: Path) -> Iterator[Path]:
     # beside it (GDAL does) are removed with the folder.
     apart.mkdir()
     try:
-        with _named(path):
+        with named(path):
             yield apart / path.name
         if path.exists() and path.is_dir() != (apart / path.name).is_dir():
             number = errno.EISDIR if path.is_dir() else errno.ENOTDIR
@@ -48,12 +48,15 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write(path: Path, data: bytes | str) -> None:
-    """Replace a file (text is UTF-8). It is not flushed: for what may be lost, but not be half."""
+    r"""Replace a file. It is not flushed: for what may be lost, but not be half.
+
+    Text is UTF-8; bytes of file names that are none are spelt out (``\udce9``).
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)  # without a folder of its own, which takes ten times as long
     try:
-        with _named(path):
-            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+        with named(path):
+            temporary.write_bytes(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -108,7 +111,7 @@ def remove(path: Path, modified: float) -> None:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def named(path: Path) -> Iterator[None]:
     """Name the file in errors of a block; that of a write to a full disk has no name."""
     try:
         yield

@@ -12,19 +12,24 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+ROOM = 64_000
+"""Bytes that must fit in: an empty file fits on a full disk, and into a quota that is used up."""
+
 
 @cache
 def private_folder() -> Path:
     """``$XDG_CACHE_HOME/rille``, else ``rille-<uid>`` in the temporary folder, else one of this process alone.
 
-    The first that can be made and that nobody else can write; each process makes the same choice.
+    The first that can be made, has room, and that nobody else can write; each process makes the same choice.
     """
     for path in _places():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.mkdir(mode=0o700, exist_ok=True)
             # Looked at after it was made: a folder that somebody else prepared under this name is passed over.
-            if _is_private(path) and os.access(path, os.W_OK | os.X_OK):
+            if _is_private(path):
+                with tempfile.TemporaryFile(dir=path) as file:
+                    file.write(bytes(ROOM))
                 return path
         except OSError:
             continue

@@ -79,7 +79,9 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     """
     limit, cleared = time.time() - grace, defaultdict[str, list[int]](list)
     refused: list[OSError] = []
-    for path, status in files(store.root, ""):
+    # The folder may be a link, as to a larger disk; other links are left alone.
+    linked = files(store.root, "artifacts") if (store.root / "artifacts").is_symlink() else []
+    for path, status in files(store.root, "") + linked:
         match = ARTIFACT.fullmatch(path)
         if status.st_mtime > limit or (match[2] in keep if match else not LEFTOVER.fullmatch(path)):
             continue

@@ -29,9 +29,12 @@ class _StoredArray(BaseModel, strict=True):
 
 
 class _Provenance(BaseModel, strict=True):
-    """Entry that is read of how an artifact came to be."""
+    """Entries that a run reads of how an artifact came to be."""
 
     seconds: float = 0.0
+    inputs: dict[str, Any] = {}
+    code: dict[str, str] = {}
+    env: dict[str, str] = {}
 
 
 class _Manifest(BaseModel, strict=True):

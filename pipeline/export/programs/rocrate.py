@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import mimetypes
+import os
 import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
@@ -125,17 +126,8 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-def describes_run(folder: Path) -> bool:
-    """Whether a folder is a crate that holds a run, as data sets are crates, too."""
-    path = folder / METADATA
-    if not path.is_file():
-        return False
-    text = read_text(path, "crate", TABLE)
-    return '"#run"' in text or '"Dataset"' not in text
-
-
-def read(folder: Path) -> Crate:
-    """Return the run that a crate describes.
+def read(folder: Path) -> Crate | None:
+    """Return the run that a crate describes; None: the folder is no crate, or one of data alone.
 
     Raises
     ------
@@ -143,8 +135,12 @@ def read(folder: Path) -> Crate:
         It is no crate of a run of Rille.
     """
     path = folder / METADATA
+    if not os.path.isfile(path):
+        return None
     try:
         entities = {one["@id"]: one for one in json.loads(read_text(path, "crate", TABLE))["@graph"]}
+        if "./" in entities and "#run" not in entities:
+            return None
         program, verb, sequence, *rest = shlex.split(entities["#run"]["name"])
         if (program, verb) != ("rille", "reconstruct"):
             raise ValueError(f"{program} {verb} is no reconstruction")

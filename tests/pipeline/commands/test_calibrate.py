@@ -12,7 +12,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.sequences.calibrate import Boards, calibrate, cover, doubts
+from rille.pipeline.commands.sequences.calibrate import Boards, _images, calibrate, cover, doubts
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -159,6 +159,15 @@ def test_complaints_say_what_to_change(tmp_path):
     with raises("RIL-010"):
         calibrate(tmp_path / "plain", tmp_path / "plain", **given)
     assert not (tmp_path / "rig.yaml").exists()
+    (tmp_path / "rig.yaml").write_text("camera_matrix: of another program\n")
+    with raises("RIL-038", "--output"):
+        calibrate(folder, folder, **given)
+
+
+def test_hidden_files_beside_the_pictures_are_passed_over(tmp_path):
+    folder = images(tmp_path / "a[1]")
+    (folder / "._left0.png").touch()
+    assert [path.name for path in _images(folder)] == ["left0.png", "left1.png", "right0.png", "right1.png"]
 
 
 @pytest.mark.data

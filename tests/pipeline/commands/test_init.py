@@ -180,3 +180,6 @@ def test_a_name_with_line_breaks_becomes_no_key(drive):
     text = Path("a.rille.toml").read_text()
     assert "# Not read:" in text
     assert "vehicle" not in tomllib.loads(text)
+    folder = folder.rename(folder.with_name("caf\udce9"))
+    with raises("RIL-185"):  # no TOML holds it
+        init(folder, output=Path("deep/er/b.rille.toml"))

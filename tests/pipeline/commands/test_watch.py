@@ -193,6 +193,8 @@ def test_what_no_file_can_mend_ends_it_at_once(scenario, tmp_path):
         command.watch("mockup-short", options=WatchOptions(**scenario.places))
     with raises("RIL-027"):
         scenario.watch(assignments=("locus.cell_sise=1",))
+    with raises("RIL-088", "mockup"):
+        scenario.watch(assignments=("mockup.frames=1",))
     assert scenario.runs == []
 
 
@@ -225,9 +227,10 @@ def test_the_results_are_those_of_a_run_of_all_frames(tmp_path, monkeypatch, cap
         "path.gpkg",
         "--quiet",
     ]
-    codes = [cli._run(["watch", "rover", "--cache", "c", "--count", "3", *given])]
+    codes = [cli._run(["watch", "./rover", "--cache", "c", "--count", "3", *given])]
     writer.join()
     watched = Path("runs/rover/latest").resolve()
+    assert (watched / "config.toml").read_text().startswith("# rille reconstruct ./rover ")
     for cache in ("c", "other"):
         codes.append(cli._run(["reconstruct", "rover", "--cache", cache, *given]))
     again, apart = sorted(path for path in Path("runs/rover").iterdir() if path.is_dir() and not path.is_symlink())[1:]

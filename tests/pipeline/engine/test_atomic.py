@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -86,3 +87,9 @@ def test_no_other_module_moves_files_into_place():
     pattern = re.compile(r"os\.(replace|link|fsync)\(|\.tmp\b|temporary\.(replace|rename)\(")
     found = [p for p in PIPELINE.rglob("*.py") if p.name != "atomic.py" and pattern.search(p.read_text("utf-8"))]
     assert [p.name for p in found] == ["maintenance.py"], "which clears away what is left over"
+
+
+def test_names_that_are_no_utf8_are_spelt_out(tmp_path):
+    atomic.write(tmp_path / "a.json", json.dumps("caf\udce9 ü", ensure_ascii=False))
+    assert (tmp_path / "a.json").read_bytes() == b'"caf\\udce9 \xc3\xbc"'
+    assert json.loads((tmp_path / "a.json").read_bytes()) == "caf\udce9 ü"

@@ -46,6 +46,14 @@ def test_what_a_machine_or_a_library_refuses_is_told_in_one_line(monkeypatch, ca
     assert line.count("\n") == 1
 
 
+@pytest.mark.parametrize("words", ["why", "compare-dem", "reconstruct", "init", "cache verify --cache", "check"])
+def test_a_name_that_is_too_long_is_an_error_of_the_command_line(capsys, words):
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), "x" * 300, *(["a"] if words == "compare-dem" else [])])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_other_errors_are_left_as_they_are():
     assert translated(ZeroDivisionError()) is None
 

@@ -29,6 +29,14 @@ def test_all_that_is_printed_passes_through(capsys):
     assert capsys.readouterr().out == "\\x1b]0;owned\\x07\\x1b[2J\\u202etxt.\\x9b1m\n"
 
 
+def test_letters_that_a_terminal_does_not_have_are_spelt_out(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, "ascii", write_through=True))
+    with plain_output():
+        print("3 °")
+    assert written.getvalue() == b"3 \\xb0\n"
+
+
 def test_a_file_of_an_evil_name_does_nothing_to_the_terminal(tmp_path, capsys):
     (tmp_path / f"{ESCAPE}.rille.toml").write_text("x = 1")
     with pytest.raises(SystemExit):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -62,9 +63,17 @@ def test_a_parent_of_another_user_is_not_used(base, monkeypatch):
     assert private_folder().parent == Path(tempfile.gettempdir())
 
 
-def test_a_folder_on_a_disk_that_may_only_be_read_is_not_used(base, monkeypatch):
-    (base / "rille").mkdir(mode=0o700)
-    monkeypatch.setattr(private.os, "access", lambda path, mode: base not in path.parents)
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])
+def test_a_folder_on_a_disk_that_takes_nothing_is_not_used(base, monkeypatch, number):
+    real = tempfile.TemporaryFile
+
+    def file(dir):
+        made = real(dir=dir)
+        if base in dir.parents:
+            made.write = lambda _: (_ for _ in ()).throw(OSError(number, os.strerror(number)))
+        return made
+
+    monkeypatch.setattr(private.tempfile, "TemporaryFile", file)
     assert private_folder().parent == Path(tempfile.gettempdir())
 
 

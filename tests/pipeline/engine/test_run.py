@@ -7,6 +7,7 @@ import signal
 import time
 import traceback
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -400,6 +401,14 @@ def test_arguments_without_canonical_form_are_named(cache):
     with pytest.raises(TypeError, match=r"numbers/3\.args\.frame is a int64"):
         ensure(cache, spec, {})
     assert "hints" not in recipe(spec, {})
+
+
+def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
+    shown = progress.Progress()
+    shown.close = lambda _: setattr(shown, "closed", True)
+    with pytest.raises(OSError, match="/dev/full"):
+        run(cache, make=mischief("fine"), ledger=Path("/dev/full"), progress=shown)
+    assert shown.closed
 
 
 @pytest.mark.parametrize("mode", ["plain", "quiet", "bar"])

@@ -297,6 +297,15 @@ def test_verify_finds_content_that_was_not_computed(cache):
     assert files(cache) == [cache / sound.path]
 
 
+@pytest.mark.parametrize("entry", [{"code": [1]}, {"inputs": 7}, {"env": {"numpy": 1}}])
+def test_an_artifact_that_does_not_say_where_it_comes_from_is_set_aside(cache, entry):
+    """Words on why a task is computed are made of it: they would end the run."""
+    commit(cache)
+    forge(file_of(cache), lambda made: made["provenance"].update(entry))
+    assert Store(cache).lookup("toy", KEY) is None
+    assert files(cache) == []
+
+
 def test_an_attempt_that_fails_leaves_nothing(cache, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")

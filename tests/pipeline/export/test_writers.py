@@ -20,6 +20,7 @@ from rille.pipeline.export.catalogue import describe
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.writers import (
     Meaning,
+    write_disparity,
     write_raster,
     write_table,
     write_trajectory_kitti,
@@ -56,6 +57,12 @@ def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
         assert "z up" in file.tags()["FRAME"]
         assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert file.overviews(1)
+
+
+def test_a_tag_may_name_a_file_that_is_no_utf8(tmp_path: Path) -> None:
+    write_disparity(tmp_path / "d.tif", np.zeros((2, 3)), np.zeros((2, 3)), {"LEFT": "caf\udce9.png"})
+    with rasterio.open(tmp_path / "d.tif") as file:
+        assert file.tags()["LEFT"] == "caf\\udce9.png"
 
 
 def test_the_engineering_crs_is_in_metres_and_says_how_axes_lie(tmp_path: Path) -> None:

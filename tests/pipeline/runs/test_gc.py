@@ -58,6 +58,31 @@ def test_what_no_kept_run_needs_goes_and_is_listed_first(two, tmp_path, capsys, 
     assert len(set(maintenance.artifacts(store))) == 9
 
 
+def test_artifacts_behind_a_link_are_cleared_away_and_nothing_else_behind_links(two, capsys):
+    folder, first, second = two
+    store, (elsewhere, mine) = Store(folder / "cache"), (folder / name for name in ("disk", "mine"))
+    (store.root / "artifacts").rename(elsewhere)
+    (store.root / "artifacts").symlink_to(elsewhere)
+    mine.mkdir()
+    (mine / "notes.txt").touch()
+    (store.root / "quarantine").symlink_to(mine)
+    for path in (*elsewhere.rglob("*.zip"), mine / "notes.txt"):
+        os.utime(path, (1.0, 1.0))
+    shutil.rmtree(second)
+    assert commands.gc(cache=store.root, runs=folder / "runs") == 0
+    assert "removed 9 artifacts and 0 leftovers" in capsys.readouterr().out
+    assert {key for _, key in maintenance.artifacts(store)} == lookup.used(first)
+    assert (mine / "notes.txt").exists()
+
+
+def test_a_damaged_line_of_a_ledger_costs_its_task_alone(two):
+    _, first, _ = two
+    whole, ledger = lookup.used(first), first / lookup.LEDGER
+    lines = ledger.read_bytes().splitlines(keepends=True)
+    ledger.write_bytes(b"".join([lines[0], b"\xff" + lines[1], *lines[2:]]))
+    assert len(lookup.used(first)) == len(whole) - 1
+
+
 def test_what_cannot_be_set_aside_is_not_said_to_be(two, capsys, monkeypatch):
     folder, _, _ = two
     store = Store(folder / "cache")

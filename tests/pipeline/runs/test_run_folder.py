@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shlex
 import tomllib
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 from raising import raises
@@ -21,6 +23,23 @@ def test_what_is_no_link_to_a_run_is_told_before_anything_is_computed(tmp_path, 
     with raises("RIL-765", str(tmp_path / "latest")):
         session._make_folder(tmp_path, NOW, "plan")
     assert [p.name for p in tmp_path.iterdir()] == ["latest"]
+
+
+def test_a_folder_that_is_a_broken_link_is_named(tmp_path):
+    (tmp_path / "runs").symlink_to("gone/runs")
+    with raises("RIL-061", "--runs"):
+        session._make_folder(tmp_path / "runs" / "toy", NOW, "plan")
+
+
+def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, capsys):
+    def refuse(path, *_, **__):
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    folder = session._make_folder(tmp_path, NOW, "plan")
+    session._point_latest(folder)
+    assert "RIL-741" in (said := capsys.readouterr().err)
+    assert folder.name in said
 
 
 def test_a_link_to_a_run_that_has_gone_is_moved(tmp_path):

@@ -65,8 +65,11 @@ def given(board_moves: float, *, back: bool = False, noise: float = 0.0) -> tupl
     return disparity, motion, Bundle({"poses": poses}, {})
 
 
-def found(board_moves: float, *, back: bool = False, noise: float = 0.0) -> np.ndarray:
+def found(board_moves: float, *, back: bool = False, noise: float = 0.0, cut: int = 0) -> np.ndarray:
+    """What moves; of images that lack the last ``cut`` rows and columns, which the coarse pixels still cover."""
     disparity, motion, segment = given(board_moves, back=back, noise=noise)
+    arrays = {name: np.asarray(array)[: ROWS - cut, : COLS - cut] for name, array in disparity.arrays.items()}
+    disparity = Bundle(arrays, {})
     out = moving_stage.run(
         MovingParams(),
         {"back": back},
@@ -80,6 +83,14 @@ def found(board_moves: float, *, back: bool = False, noise: float = 0.0) -> np.n
 @pytest.mark.parametrize("back", [False, True])
 def test_a_still_scene_has_nothing_that_moves_whatever_the_camera_does(back: bool) -> None:
     assert not found(0.0, back=back, noise=0.8).any()
+
+
+@pytest.mark.parametrize("cut", [1, 3])
+def test_sides_of_the_image_need_be_no_multiples_of_a_coarse_pixel(cut: int) -> None:
+    mask, whole = found(0.5, cut=cut), found(0.5)[:-cut, :-cut]
+    assert mask.shape == whole.shape
+    assert mask.any()
+    assert (mask == whole).mean() > 0.99
 
 
 @pytest.mark.parametrize("back", [False, True])

@@ -199,6 +199,11 @@ def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
     assert local_lattice(view, cell, params).rows > 0
     with raises("RIL-344"):
         local_lattice(view, 0.5 * cell, params.model_copy(update={"max_sigma": 0.5 * cell}))
+    with raises("RIL-344", "locus.max_sigma") as stated:
+        local_lattice(view, cell, params.model_copy(update={"max_sigma": 0.01 * cell}))
+    assert "cell_size" not in stated.value.remedy
+    sigma = float(stated.value.remedy.split("locus.max_sigma to ")[1].split()[0])
+    assert local_lattice(view, cell, params.model_copy(update={"max_sigma": sigma})).rows > 0
 
 
 WALL = pitched(90.0)

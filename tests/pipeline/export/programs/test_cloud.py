@@ -148,6 +148,17 @@ def test_equal_runs_make_equal_files(tmp_path: Path) -> None:
         assert {p.name for p in tmp_path.iterdir()} <= {"run0", "run1", "a.laz", "a.ply"}
 
 
+def test_a_first_pair_without_points_leaves_the_place_of_the_others(tmp_path: Path) -> None:
+    """Offsets and steps of the coordinates are those of the first pair that has points."""
+    run = Recorded(tmp_path / "run", PLACE)
+    run.made["hfvm/3"].arrays["validity"][:] = Validity.INTERPOLATED  # type: ignore[index]
+    written(run, tmp_path / "a.LAZ")
+    las = laspy.read(tmp_path / "a.LAZ")
+    assert set(las["pair"]) == {5}
+    np.testing.assert_allclose(np.median(las.xyz[:, :2], axis=0), PLACE.origin[:2], atol=20.0)
+    assert las.header.scales[0] < 0.1
+
+
 def test_a_run_without_a_posed_pair_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     run = Recorded(tmp_path / "run")
     for pair in (3, 5):
