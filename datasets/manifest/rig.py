@@ -75,7 +75,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"{name}: rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
         raise InputError("RIL-021", text, remedy="estimate it from runs with this calibration")
-    _check_baseline(rig.baseline, manifest.rig, name)
+    check_baseline(rig.baseline, manifest.rig, name)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
@@ -209,8 +209,8 @@ def _stated(section: RigSection) -> RigidTransform | None:
     return None if section.baseline is None else parallel(section.baseline)
 
 
-def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
-    """Refuse what cannot be metres."""
+def check_baseline(baseline: float, section: RigSection, name: str) -> None:
+    """Refuse a length (m) that cannot be metres."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
         units = f"rig.unit = {section.unit / 1000:g} or {section.unit / 100:g}"
