@@ -219,7 +219,7 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
         line = warning("RIL-825", f"{path} has no {missing}: its cameras are those of {' and '.join(beside.files)}")
         optics = read_optics(manifest, path.parent, str(path), sizes)
         return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
-    (left, turned), (right, _) = (_camera(path, *one) for one in zip(topics, infos, strict=True))
+    (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
     rig, lenses = rig_of(left, right, sizes)
     check_baseline(rig.baseline, RigSection(), str(path))
     return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
