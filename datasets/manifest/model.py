@@ -450,5 +450,7 @@ def read_manifest(path: Path) -> Manifest:
     InputError
         It cannot be read, is not TOML, or a key is unknown, missing or not permitted; the message names the key.
     """
-    remedy = "`rille init FOLDER` writes one to begin with"
-    return validated("RIL-223", Manifest, read_toml(path, "manifest"), file=str(path), remedy=remedy)
+    values = read_toml(path, "manifest")
+    # Of one that names images, the wrong key and value say what to correct.
+    remedy = "" if "images" in values else "`rille init FOLDER` writes one to begin with"
+    return validated("RIL-223", Manifest, values, file=str(path), remedy=remedy)

@@ -572,6 +572,7 @@ def test_bad_manifests(tmp_path, parts, expected):
     with raises(*expected) as caught:
         opened(path)
     assert "\n" not in str(caught.value)
+    assert "rille init" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
