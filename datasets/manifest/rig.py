@@ -210,13 +210,16 @@ def _stated(section: RigSection) -> RigidTransform | None:
 
 
 def check_baseline(baseline: float, section: RigSection, name: str) -> None:
-    """Refuse a length (m) that cannot be metres."""
+    """Refuse a length (m) that looks like one in another unit, unless the unit is stated."""
     from_files = section.baseline is None and section.T_right_left is None
-    if baseline > LONGEST_BASELINE:
-        units = f"rig.unit = {section.unit / 1000:g} or {section.unit / 100:g}"
-        hint = f"a manifest's {units} reads a calibration in these" if from_files else "give metres"
+    if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
+        hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres or centimetres"
-        raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}")
+        raise InputError(
+            "RIL-244",
+            text,
+            remedy=f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it",
+        )
 
 
 def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
