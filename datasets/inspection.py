@@ -151,9 +151,13 @@ def inspect(folder: Path) -> Findings:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Files below a folder in natural order, hidden ones left out."""
-    entries = (e for _, entries in Search().below(folder, DEPTH, links=True) for e in entries)
-    return sorted((Path(e.path) for e in entries if is_file(e.path)), key=lambda path: natural(str(path)))
+    """Files below a folder in natural order, without hidden ones and what Rille wrote, its manifests and runs."""
+    found = list(Search().below(folder, DEPTH, links=True))
+    # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
+    runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
+    paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)
+    kept = (path for path in paths if is_file(path) and not path.name.endswith(".rille.toml"))
+    return sorted(kept, key=lambda path: natural(str(path)))
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -107,7 +107,7 @@ def _rectified(camera: CalibratedCamera, name: str) -> CalibratedCamera:
     if camera.rectified is None and not camera.lens.ideal:
         raise InputError(
             "RIL-816",
-            f"{name}: the images are rectified by their name, and the calibration of camera {camera.name} has a "
+            f"{name}: the images are taken as rectified, and the calibration of camera {camera.name} has a "
             "distortion, which would be taken off twice",
             remedy="give the calibration of the rectified images (P), or images.rectified = false if they are raw",
         )

@@ -257,6 +257,18 @@ def test_a_whole_folder_opens_at_once(tmp_path):
     assert s.attitude is None
 
 
+def test_what_a_run_left_in_the_folder_is_no_truth_and_no_images(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    run = tmp_path / "runs" / "seq" / "20261128T190548Z-22bd21ca"
+    write_images(run / "frames", both("{side}_{name}.png", ["1", "2", "3"]))
+    write_lines(run / "ledger.jsonl", ["{}"])
+    write_lines(run / "trajectory.tum", [f"{k} 0 0 {k} 0 0 0 1" for k in range(2)])
+    (run.parent / "latest").symlink_to(run.name)
+    write_lines(tmp_path / "seq.rille.toml", ["[images]", "# a: b: c"])
+    found = inspect(tmp_path)
+    assert (found.tables, found.unread, found.views.pairs) == ({}, [], 2)
+
+
 def test_the_first_of_several_tables_is_named_and_the_others_stand_in_a_comment(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     for name in ("stamps.txt", "times.txt"):
