@@ -177,7 +177,7 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
         taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
         if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
             text = f"{path}: two images of {topic} have the stamp {stamp}"
-            raise InputError("RIL-258", text, remedy="record header.stamp as the time when an image was taken")
+            raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
     return found
 
 
@@ -259,8 +259,7 @@ def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[Calibrate
         entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
     else:
         entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
-        entries |= {"distortion_model": given["distortion_model"] or "plumb_bob"}
-        entries |= {"distortion_coefficients": given["d"]}
+        entries |= {"distortion_model": given["distortion_model"] or "plumb_bob", "distortion_coefficients": given["d"]}
     fields = Fields(entries, f"{path} {_beside(topic)}")
     turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
     return opencv.single(fields, path)[0], turned
@@ -277,8 +276,8 @@ def _movement(
     # frame_id names the camera as it is mounted; a rectified image is turned by R against it.
     T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
 
-    def placed(kind: str, place: Any) -> tuple[str, list[Any], RigidTransform] | None:
-        """The only topic of a kind with its messages, and the left image's pose in its frame."""
+    def placed(kind: str, place: Any) -> tuple[str, list[Any], tuple[float, ...], RigidTransform] | None:
+        """The only topic of a kind with its messages and their times, and the left image's pose in its frame."""
         topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
         if not topics:
             return None
@@ -291,23 +290,22 @@ def _movement(
             text = f"{path}: {FRAMES} does not say how {frame!r} stands in {place(messages[0])!r}: "
             warnings.append(warning("RIL-951", f"{text}{topics[0]} is not used"))
             return None
-        return topics[0], sorted(messages, key=_stamp), T_sensor_camera @ T_camera_image
+        messages.sort(key=_stamp)
+        stamps = seconds([_stamp(m) for m in messages], f"{path} {topics[0]}", unit="ns")
+        return topics[0], messages, stamps, T_sensor_camera @ T_camera_image
 
     inertial, odometry = Inertial(), None
     found = placed(IMU, lambda m: m.header.frame_id)
     if found is not None:
-        topic, messages, T_imu_left = found
+        topic, messages, stamps, T_imu_left = found
         rates, forces = (
             np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in messages)])
             for name in ("angular_velocity", "linear_acceleration")
         )
-        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
-        record = ImuRecord(np.array(stamps), rates, forces, topic)
-        inertial = at_frames(record, times, T_imu_left)
+        inertial = at_frames(ImuRecord(np.array(stamps), rates, forces, topic), times, T_imu_left)
     found = placed(ODOMETRY, lambda m: m.child_frame_id)
     if found is not None:
-        topic, messages, T_base_left = found
-        stamps = seconds([_stamp(m) for m in messages], f"{path} {topic}", unit="ns")
+        topic, messages, stamps, T_base_left = found
         timed = TimedPoses(stamps, tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages), topic)
         # s; odometry is interpolated over no longer gap
         between = interpolate(timed, times, 0.5)

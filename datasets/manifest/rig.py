@@ -215,11 +215,8 @@ def check_baseline(baseline: float, section: RigSection, name: str) -> None:
     if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres or centimetres"
-        raise InputError(
-            "RIL-244",
-            text,
-            remedy=f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it",
-        )
+        remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
+        raise InputError("RIL-244", text, remedy=remedy)
 
 
 def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:

@@ -281,7 +281,7 @@ def test_two_images_of_one_stamp_are_refused_and_a_copy_of_a_message_is_not(tmp_
     bag.rows += bag.rows[-2:]
     assert open_sequence(str(bag.write(tmp_path / "copied"))).frames == 3
     bag.image(LEFT, START, picture(1, 0), pad=4)
-    with raises("RIL-258", LEFT, str(START), "header.stamp"):
+    with raises("RIL-993", LEFT, str(START), "header.stamp"):
         open_sequence(str(bag.write(tmp_path / "stamps")))
 
 
