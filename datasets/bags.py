@@ -28,11 +28,10 @@ from rille.datasets.images.headers import Header, sizes_of
 from rille.datasets.images.pairing import join, two_sides
 from rille.datasets.imu import ImuRecord, Inertial, at_frames
 from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
-from rille.datasets.manifest.model import Cameras, Images, Manifest
-from rille.datasets.manifest.rig import CAR, STREET, Optics, read_optics, unusual_cameras
+from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
+from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
-from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
@@ -178,14 +177,13 @@ def _stamp(message: Any) -> int:
 def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     """Images of a topic by their stamp, ns."""
     found: dict[int, TakenImage] = {}
-    number = 0
     for at, data, message in _messages(reader, topic):
-        number, stamp = number + 1, _stamp(message)
+        stamp = _stamp(message)
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
-        found[stamp] = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
-    if number > 2 * len(found):  # of a driver that fills none in
-        text = f"{path}: {number} images of {topic} have {count(len(found), 'time stamp')} (header.stamp)"
-        raise InputError("RIL-939", text, remedy="record them with the times at which they were taken")
+        taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
+        if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
+            text = f"{path}: two images of {topic} have the stamp {stamp}"
+            raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
     return found
 
 
@@ -210,53 +208,65 @@ def _joined(
 
 def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, np.ndarray]:
     """Cameras of the image topics, and the rotation from the left one's frame to its images'."""
-    if not any(c.msgtype == INFO for c in reader.connections):
+    infos = [_info(reader, topic) for topic in topics]
+    missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
+    if missing is not None:
         found = Findings(path.parent, FoundImages("", "", 0, sizes, ""))
         find_calibration(found, [p for p in sorted(path.parent.iterdir()) if p.suffix.lower() in CALIBRATIONS])
         beside = found.calibration
-        if beside is not None and beside.baseline is not None:
-            stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
-            cameras = Cameras.model_validate({**stated, "names": beside.names})
-            manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
-            text = f"{path} has no camera_info: its cameras are those of {' and '.join(beside.files)}"
-            line = warning("RIL-825", text)
-            optics = read_optics(manifest, path.parent, str(path), sizes)
-            return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
-    (left, turned), (right, _) = (_camera(reader, path, topic) for topic in topics)
+        if beside is None or beside.baseline is None:
+            there = sorted({c.topic for c in reader.connections if c.msgtype == INFO})
+            text = f"{path} has no {missing} of a calibrated camera (camera_info: {', '.join(there) or 'none'})"
+            remedy = "record that of both cameras, put a calibration file beside the bag, or write a manifest"
+            raise InputError("RIL-949", text, remedy=remedy)
+        stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
+        cameras = Cameras.model_validate({**stated, "names": beside.names})
+        manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
+        line = warning("RIL-825", f"{path} has no {missing}: its cameras are those of {' and '.join(beside.files)}")
+        optics = read_optics(manifest, path.parent, str(path), sizes)
+        return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
+    (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
     rig, lenses = rig_of(left, right, sizes)
+    check_baseline(rig.baseline, RigSection(), str(path))
     return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
 
 
-def _camera(reader: Any, path: Path, topic: str) -> tuple[CalibratedCamera, np.ndarray]:
-    """Camera of an image topic by the ``camera_info`` beside it, and the rotation from its frame to the image's."""
-    place = topic.removesuffix("/compressed").rpartition("/")[0]
-    name = f"{place}/camera_info"
-    message = next((m for _, _, m in _messages(reader, name)), None)
-    if message is None:
-        there = sorted({c.topic for c in reader.connections if c.msgtype == INFO})
-        text = f"{path} has no {name} for {topic} (camera_info: {', '.join(there) or 'none'})"
-        remedy = "record the camera_info of both cameras, put a calibration file beside the bag, or write a manifest"
-        raise InputError("RIL-949", text, remedy=remedy)
-    # ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
-    given = {key.lower(): getattr(message, key) for key in dir(message) if key.lower() in ("k", "d", "r", "p")}
+def _beside(topic: str) -> str:
+    """Topic of the ``camera_info`` of an image topic."""
+    return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+
+
+def _info(reader: Any, topic: str) -> dict[str, Any] | None:
+    """Fields of the first ``camera_info`` of an image topic whose P is not 0, as that of no calibrated camera is.
+
+    ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
+    """
+    infos = (
+        {key.lower(): getattr(m, key) for key in m.__dataclass_fields__}
+        for _, _, m in _messages(reader, _beside(topic))
+    )
+    return next((one for one in infos if np.any(one["p"])), None)
+
+
+def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[CalibratedCamera, np.ndarray]:
+    """Camera of an image topic by its ``camera_info``, and the rotation from its frame to the image's."""
     rectified = RECTIFIED.search(topic) is not None
     entries: dict[str, Any] = {
-        "image_width": message.width,
-        "image_height": message.height,
+        "image_width": given["width"],
+        "image_height": given["height"],
         "projection_matrix": given["p"],
         "camera_name": topic,
-        "binning_x": message.binning_x,
-        "binning_y": message.binning_y,
-        "roi": {key: getattr(message.roi, key) for key in ("x_offset", "y_offset", "width", "height")},
+        "binning_x": given["binning_x"],
+        "binning_y": given["binning_y"],
+        "roi": {key: getattr(given["roi"], key) for key in ("x_offset", "y_offset", "width", "height")},
     }
     if rectified:
         # The images are rectified already: P alone is their camera, and R must not be applied again.
         entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
     else:
         entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
-        entries |= {"distortion_model": message.distortion_model or "plumb_bob"}
-        entries |= {"distortion_coefficients": given["d"]}
-    fields = Fields(entries, f"{path} {name}")
+        entries |= {"distortion_model": given["distortion_model"] or "plumb_bob", "distortion_coefficients": given["d"]}
+    fields = Fields(entries, f"{path} {_beside(topic)}")
     turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
     return opencv.single(fields, path)[0], turned
 

@@ -21,7 +21,7 @@ from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import unread
+from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, is_file, read_lines
@@ -113,7 +113,8 @@ def inspect(folder: Path) -> Findings:
         a file that is looked at cannot stand in a manifest.
     """
     if not folder.is_dir():
-        raise InputError("RIL-193", f"{folder} is no folder", remedy="name a folder that holds images of two cameras")
+        remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
+        raise InputError("RIL-193", f"{folder} is no folder", remedy=remedy)
     there = _files(folder)
     paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
@@ -150,9 +151,13 @@ def inspect(folder: Path) -> Findings:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Files below a folder in natural order, hidden ones left out."""
-    entries = (e for _, entries in Search().below(folder, DEPTH, links=True) for e in entries)
-    return sorted((Path(e.path) for e in entries if is_file(e.path)), key=lambda path: natural(str(path)))
+    """Files below a folder in natural order, without hidden ones and what Rille wrote, its manifests and runs."""
+    found = list(Search().below(folder, DEPTH, links=True))
+    # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
+    runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
+    paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)
+    kept = (path for path in paths if is_file(path) and not path.name.endswith(".rille.toml"))
+    return sorted(kept, key=lambda path: natural(str(path)))
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -236,9 +236,11 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())
     if not order or table.columns < len(order) or (form == "tum" and table.columns > len(order)):
+        seen = f"columns {', '.join(table.header)}" if table.header else f"{table.columns} numbers"
+        stated = "" if format == "auto" else f" of format {format}"
         raise InputError(
             "RIL-264",
-            f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no pose of format {form}",
+            f"{table.name}, line {table.lines[0]}: {seen} are no pose{stated}",
             remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv), as "
             "time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
         )

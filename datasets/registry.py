@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from rille.datasets.images.files import Digests
-from rille.datasets.images.kinds import unread
+from rille.datasets.images.kinds import hints
 from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.images.samples import examined
@@ -141,7 +141,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
             return sequence
     if path.is_file():
         remedy = "give the folder, of a ROS 2 bag too, or a manifest (.toml); `rille init FOLDER` writes one"
-        remedy = "; ".join([*unread([name_or_path]), remedy])
+        remedy = "; ".join([*hints(name_or_path), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
     remedy = (

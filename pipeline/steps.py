@@ -494,7 +494,8 @@ def path(
     settings = _merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
     given = _bundle(hazards, risk_stage.risk_stage, "risk", "rille.hazards")
-    planned = path_stage.path_stage.run(built.path, {} if ends else {"use": "local"}, {"risk": given})
+    asked = built.path.start is not None or built.path.target is not None
+    planned = path_stage.path_stage.run(built.path, {} if asked else {"use": "local"}, {"risk": given})
     return _dataset(path_stage.path_stage, planned, settings)
 
 

@@ -82,9 +82,10 @@ def opened(path: Path) -> Iterator[Any]:
     except RilleError:
         raise
     except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         text = f"{path} cannot be read as a bag: {reason}"
-        raise InputError("RIL-941", text, remedy="record or copy it again") from error
+        remedy = "copy it again; `mcap recover` or `rosbag reindex` mends a recording that broke off"
+        raise InputError("RIL-941", text, remedy=remedy) from error
 
 
 def depth(message: Any, name: str) -> Header:

@@ -45,6 +45,11 @@ def kind_of(name: str) -> str:
     return next((kind for kind, (endings, _) in KINDS.items() if ending in endings.split()), "file")
 
 
+def hints(name: str) -> list[str]:
+    """What to do with a file whose ending tells its kind: one line, or none."""
+    return unread([name] if kind_of(name) != "file" else [])
+
+
 def unread(names: Iterable[str]) -> list[str]:
     """A line for each kind of file that is not read: their number, the first one, what to do."""
     groups: dict[str, list[str]] = defaultdict(list)

@@ -158,7 +158,7 @@ class RigSection(Table):
     baseline : m; the right camera stands that far along the left one's x axis.
     T_right_left : rows of [R | t], m: x_right = R x_left + t.
     file : rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed.
-    unit : m; length of one unit of the calibration files, 0.001 where they say mm.
+    unit : m; length of one unit of the calibration files, 0.001 where they say mm; 1 lets a baseline exceed 20 m.
     """
 
     baseline: float | None = None
@@ -450,5 +450,7 @@ def read_manifest(path: Path) -> Manifest:
     InputError
         It cannot be read, is not TOML, or a key is unknown, missing or not permitted; the message names the key.
     """
-    remedy = "`rille init FOLDER` writes one to begin with"
-    return validated("RIL-223", Manifest, read_toml(path, "manifest"), file=str(path), remedy=remedy)
+    values = read_toml(path, "manifest")
+    # Of one that names images, the wrong key and value say what to correct.
+    remedy = "" if "images" in values else "`rille init FOLDER` writes one to begin with"
+    return validated("RIL-223", Manifest, values, file=str(path), remedy=remedy)

@@ -75,7 +75,7 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"{name}: rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
         raise InputError("RIL-021", text, remedy="estimate it from runs with this calibration")
-    _check_baseline(rig.baseline, manifest.rig, name)
+    check_baseline(rig.baseline, manifest.rig, name)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
@@ -107,7 +107,7 @@ def _rectified(camera: CalibratedCamera, name: str) -> CalibratedCamera:
     if camera.rectified is None and not camera.lens.ideal:
         raise InputError(
             "RIL-816",
-            f"{name}: the images are rectified by their name, and the calibration of camera {camera.name} has a "
+            f"{name}: the images are taken as rectified, and the calibration of camera {camera.name} has a "
             "distortion, which would be taken off twice",
             remedy="give the calibration of the rectified images (P), or images.rectified = false if they are raw",
         )
@@ -209,14 +209,14 @@ def _stated(section: RigSection) -> RigidTransform | None:
     return None if section.baseline is None else parallel(section.baseline)
 
 
-def _check_baseline(baseline: float, section: RigSection, name: str) -> None:
-    """Refuse what cannot be metres."""
+def check_baseline(baseline: float, section: RigSection, name: str) -> None:
+    """Refuse a length (m) that looks like one in another unit, unless the unit is stated."""
     from_files = section.baseline is None and section.T_right_left is None
-    if baseline > LONGEST_BASELINE:
-        units = f"rig.unit = {section.unit / 1000:g} or {section.unit / 100:g}"
-        hint = f"a manifest's {units} reads a calibration in these" if from_files else "give metres"
+    if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
+        hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres or centimetres"
-        raise InputError("RIL-244", text, remedy=f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}")
+        remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
+        raise InputError("RIL-244", text, remedy=remedy)
 
 
 def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:

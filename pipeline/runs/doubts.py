@@ -44,7 +44,8 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
     ok = matched_back(result.validity, result.backmatch_error)
     # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
     alike = left.shape == right.shape
-    explains_all = _unmatched(result) or _without_texture(result) or (_exchanged(result, ok) if alike else "")
+    one = warning("RIL-708", "left and right are one image") if np.array_equal(left, right) else ""
+    explains_all = _unmatched(result) or _without_texture(result) or one or (_exchanged(result, ok) if alike else "")
     if explains_all:
         yield explains_all
     elif closely:

@@ -136,7 +136,8 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
     marks |= {"suspects": suspects} if suspects else {}
     warnings += [] if turned else _doubts(share, after)
-    moves, knocked = _drift(linearised(given, pairs), per_pair, params)
+    # Beside a calibration of other images the differences between pairs say nothing.
+    moves, knocked = ([], "") if far else _drift(linearised(given, pairs), per_pair, params)
     warnings += moves
     marks |= {"knocked": knocked} if knocked else {}
     return {
@@ -184,6 +185,14 @@ def _word(p: Parameter) -> str:
     return p.name.replace("_", " ")
 
 
+def _off(p: Parameter) -> str:
+    """By how much a parameter is off, in words; of turned images the linear estimate is no angle."""
+    if abs(p.value) < math.radians(MAX_IMAGE_TURN_DEG):
+        return f"{_word(p)} is off by {math.degrees(p.value):+.2f} degrees"
+    turned = "" if p.name == "baseline_forward" else " (are the images of both cameras turned?)"
+    return f"{_word(p)} is off by more than {MAX_IMAGE_TURN_DEG:g} degrees{turned}"
+
+
 def _source(decision: Decision, applied: bool, pairs: int) -> str:
     if not applied:
         return "given calibration"
@@ -205,7 +214,7 @@ def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
         if p.freed and p.name == "roll":
             parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
         elif p.freed and p.name != told:
-            parts.append(f"{_word(p)} is off by {degrees:+.2f} degrees")
+            parts.append(_off(p))
     return ", ".join(parts)
 
 

@@ -140,9 +140,11 @@ def _why(reason: str, maps: Maps, vehicle: Vehicle) -> str:
         return reason
     counts = [int(((maps["reason"] & m.bit) > 0).sum()) for m in MEASURES]
     most, count = max(zip(MEASURES, counts, strict=True), key=lambda pair: pair[1])
+    # Angles do not depend on the scale, but on the vertical.
+    asked = ", and is the vertical right (world.up)?" if most.in_degrees else " at the scale of the sequence?"
     return (
         f"all {judged} known cells are hazardous, {100 * count / judged:.0f} % of them by {most.words}: "
-        f"is vehicle.{most.limit} {getattr(vehicle, most.limit):g} at the scale of the sequence?"
+        f"is vehicle.{most.limit} {getattr(vehicle, most.limit):g}{asked}"
     )
 
 

@@ -162,7 +162,8 @@ class PlaneView:
             by_cell = np.sort(np.maximum(self.along / max_cells, 0.0 if stated else sigma_d / self.slope))[:3][-1]
             by_sigma = np.sort((sigma_d / self.slope)[self.along <= max_cells * max(cell, by_cell)])[:3][-1]
             needs = (("cell_size", cell, by_cell), ("max_sigma", max_sigma, by_sigma if stated else 0.0))
-            remedy = " and ".join(f"locus.{n} to {1.1 * need:.2g} m or more" for n, has, need in needs if need > has)
+            least = ((n, float(f"{1.1 * need:.2g}")) for n, has, need in needs if need > has)
+            remedy = " and ".join(f"locus.{n} to {need:g} m or more" for n, need in least)
             text = f"no ground is seen well enough for cells of {cell:g} m"
             raise CoarseGroundError("RIL-344", text, remedy=f"set {remedy}")
         low, high = np.quantile(self.xyz[good, :2], [self.stray, 1.0 - self.stray], axis=0)

@@ -306,7 +306,7 @@ def test_images_without_time_stamps_are_refused(tmp_path):
     for topic, _, message in bag.rows:
         if topic in (LEFT, RIGHT):
             message.header = bag.header(0)
-    with raises("RIL-939", LEFT, "3 images", "1 time stamp"):
+    with raises("RIL-993", LEFT, "stamp 0"):
         open_sequence(str(bag.write(tmp_path)))
 
 
@@ -316,6 +316,24 @@ def test_images_without_a_partner_are_left_out(tmp_path):
     sequence = open_sequence(str(bag.write(tmp_path)))
     assert sequence.frames == 2
     assert any("RIL-948" in line for line in sequence.warnings)
+
+
+def test_two_images_of_one_stamp_are_refused_and_a_copy_of_a_message_is_not(tmp_path):
+    bag = street()
+    bag.rows += bag.rows[-2:]
+    assert open_sequence(str(bag.write(tmp_path / "copied"))).frames == 3
+    bag.image(LEFT, START, picture(1, 0), pad=4)
+    with raises("RIL-993", LEFT, str(START), "header.stamp"):
+        open_sequence(str(bag.write(tmp_path / "stamps")))
+
+
+def test_lengths_in_a_bag_that_are_no_metres_are_refused(tmp_path):
+    bag, right = street(infos=False), [*P]
+    right[3] = -50.0 * 500
+    bag.info("/stereo/left/camera_info", (64, 48), P)
+    bag.info("/stereo/right/camera_info", (64, 48), right)
+    with raises("RIL-244", "500 m", "0.5"):
+        open_sequence(str(bag.write(tmp_path)))
 
 
 def test_init_says_that_a_bag_opens_as_it_is(tmp_path, capsys):
@@ -378,8 +396,13 @@ projection_matrix: {{rows: 3, cols: 4, data: [70, 0, 31, {tx}, 0, 70, 24, 0, 0, 
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_calibration_file_beside_a_bag_stands_for_its_camera_info(tmp_path, form):
-    path = street(form, infos=False).write(tmp_path)
+@pytest.mark.parametrize("right", [None, [0.0] * 12])  # none at all, or of a camera that is not calibrated
+def test_a_calibration_file_beside_a_bag_stands_for_its_camera_info(tmp_path, form, right):
+    bag = street(form, infos=False)
+    if right:
+        bag.info("/stereo/left/camera_info", (64, 48), P)
+        bag.info("/stereo/right/camera_info", (64, 48), right)
+    path = bag.write(tmp_path)
     folder = path.parent
     with raises("RIL-949"):
         open_sequence(str(path))

@@ -92,6 +92,8 @@ def test_images_that_cannot_be_told_apart(tmp_path):
         inspect(tmp_path)
     with raises("RIL-193"):
         inspect(tmp_path / "nothing")
+    with raises("RIL-193", "ZED SDK"):
+        inspect(tmp_path / "drive.svo")
     with raises("RIL-194"):
         find_views(tmp_path, [])
 
@@ -253,6 +255,33 @@ def test_a_whole_folder_opens_at_once(tmp_path):
     assert s.truth[2] is not None
     assert s.truth[2].translation[0] == 2.0
     assert s.attitude is None
+
+
+def test_what_a_run_left_in_the_folder_is_no_truth_and_no_images(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    run = tmp_path / "runs" / "seq" / "20261128T190548Z-22bd21ca"
+    write_images(run / "frames", both("{side}_{name}.png", ["1", "2", "3"]))
+    write_lines(run / "ledger.jsonl", ["{}"])
+    write_lines(run / "trajectory.tum", [f"{k} 0 0 {k} 0 0 0 1" for k in range(2)])
+    (run.parent / "latest").symlink_to(run.name)
+    write_lines(tmp_path / "seq.rille.toml", ["[images]", "# a: b: c"])
+    found = inspect(tmp_path)
+    assert (found.tables, found.unread, found.views.pairs) == ({}, [], 2)
+
+
+def test_the_first_of_several_tables_is_named_and_the_others_stand_in_a_comment(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    for name in ("stamps.txt", "times.txt"):
+        write_lines(tmp_path / name, ["0.0", "0.5"])
+    for name in ("a.txt", "b.txt"):
+        write_lines(tmp_path / name, [f"1 0 0 {k} 0 1 0 0 0 0 1 0" for k in range(2)])
+    text = manifest_text(inspect(tmp_path), ".")
+    stated = tomllib.loads(text)
+    assert (stated["times"], stated["truth"]) == ({"file": "stamps.txt"}, {"file": "a.txt"})
+    assert [line for line in text.splitlines() if line.startswith("# Other")] == [
+        "# Others: times.txt",
+        "# Other tables of poses: b.txt",
+    ]
 
 
 @pytest.mark.parametrize(

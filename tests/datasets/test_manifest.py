@@ -522,6 +522,13 @@ def test_sensors_need_times(tmp_path):
         opened(write_sequence(tmp_path, text))
 
 
+def test_a_baseline_of_two_stations_far_apart_is_read_where_its_unit_is_stated(tmp_path):
+    rig = "[rig]\nbaseline = 97\n"
+    with raises("RIL-244", "0.097 or 0.97", "rig.unit = 1"):
+        opened(write_sequence(tmp_path, rig=rig))
+    assert opened(write_sequence(tmp_path, rig=rig + "unit = 1\n")).rig.baseline == pytest.approx(97.0)
+
+
 # -- bad input, one line each ------------------------------------------------------------------------------------------
 
 
@@ -579,6 +586,7 @@ def test_bad_manifests(tmp_path, parts, expected):
     with raises(*expected) as caught:
         opened(path)
     assert "\n" not in str(caught.value)
+    assert "rille init" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,14 @@ def test_a_file_that_is_no_sequence_says_what_to_do_with_it(tmp_path, name, step
         open_sequence(str(tmp_path / name))
 
 
+@pytest.mark.parametrize("name", ["left.png", "times.txt"])
+def test_a_file_of_a_sequence_is_not_called_unknown(tmp_path, name):
+    (tmp_path / name).write_bytes(b"x")
+    with raises("RIL-992", "give the folder") as caught:
+        open_sequence(str(tmp_path / name))
+    assert "neither" not in str(caught.value)
+
+
 def test_a_folder_of_images_that_are_not_read_says_so(tmp_path):
     for side in ("left", "right"):
         (tmp_path / side).mkdir()

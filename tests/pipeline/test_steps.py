@@ -136,6 +136,8 @@ def test_places_and_goals_are_in_metres(dem: Any) -> None:
         assert np.asarray(found.path[-1, :2]) == pytest.approx(goal, abs=0.004)
     else:
         assert found.attrs["reason"]
+    with raises("RIL-406", "999"):
+        rille.path(hazards, target=(999.0, 999.0))
 
 
 def test_the_vehicle_may_be_a_file(dem: Any, tmp_path: Path) -> None:

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from rille.pipeline.commands.complaints import complain
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import FILES, export_run
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, RilleError
 
 Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
 
@@ -48,12 +49,17 @@ def export(
     if output is not None and len(to) > 1:
         text = f"--output names one place for {len(to)} forms"
         raise ConfigError("RIL-020", text, remedy="give one --to, or leave --output out")
-    folder, store = lookup.find(run, runs), Store(cache_folder(cache))
+    folder, store, code = lookup.find(run, runs), Store(cache_folder(cache)), COMPLETE
     for form in to:
         if output is not None and form in FILES:
             check_output(output, f".{form}")
         path = output or folder / FILES.get(form, form)
         thinning = {"every": every, "voxel": voxel} if form in ("laz", "ply") else {}
-        with lookup.reading(folder):
-            print(f"{path}  {export_run(form, folder, path, store, **thinning)}")
-    return COMPLETE
+        try:
+            with lookup.reading(folder):
+                print(f"{path}  {export_run(form, folder, path, store, **thinning)}")
+        except RilleError as error:  # what one form lacks, the others may do without
+            if form == to[-1]:
+                raise
+            code = complain(error)
+    return code

@@ -12,6 +12,7 @@ from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, stree
 from terrain_scenes import toed_in_rig
 
 from rille.stages.calibration import rig as rig_stage
+from rille.stages.calibration.parameter_selection import Parameter
 from rille.stages.calibration.relative_orientation import RIG, PointPairs, linearised
 from rille.stages.calibration.rig import RigParams, _drift, orient_rig
 from rille.stages.core.declare import Bundle
@@ -291,6 +292,19 @@ def test_turned_images_are_named_and_no_knock(degrees, words):
     assert words in found["contradiction"]
     assert found["warnings"] == [found["contradiction"]]
     assert "contradiction" not in facts(rig, street(roll_deg=4.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "degrees", "words"),
+    [
+        ("baseline_across", -3.0, "baseline across is off by -3.00 degrees"),
+        ("baseline_across", 837.0, "more than 45 degrees (are the images of both cameras turned?)"),
+        ("baseline_forward", -60.0, "baseline forward is off by more than 45 degrees"),
+    ],
+)
+def test_no_angle_of_a_linear_estimate_is_larger_than_it_can_be(name, degrees, words):
+    angle = np.radians(degrees)
+    assert rig_stage._off(Parameter(name, angle, angle, 0.01, True, True, "")).endswith(words)
 
 
 def test_a_pair_whose_rows_no_rig_explains_is_a_suspect():

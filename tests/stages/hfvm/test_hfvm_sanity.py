@@ -21,6 +21,11 @@ def test_a_rigid_scene_without_repetition_is_not_doubted():
     assert codes(left, right) == []
 
 
+def test_an_image_that_is_matched_with_itself_is_doubted():
+    left, *_ = pair(rig_displacement(convergent_rig(), lambda x, y: 1.5 + 0.3 * np.sin(x / 25)), noise=1.0)
+    assert codes(left, left.copy()) == ["RIL-708"]
+
+
 def test_a_chess_board_is_doubted_wherever_it_lies():
     y, x = np.indices((200, 320))
     board = cv2.GaussianBlur(((x // 12 + y // 12) % 2 * 120 + 60).astype(np.uint8), (0, 0), 1)

@@ -346,7 +346,9 @@ def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
     given = maps(np.full_like(risk, HAZARDOUS), z, "tilt")
     facts = describe(find_path(given, lattice, SHORT), given, lattice, SHORT)
     assert facts["found"] is False
-    assert [fact for fact in ("1200", "tilt", "vehicle.max_slope_deg 20") if fact not in facts["reason"]] == []
+    assert [
+        fact for fact in ("1200", "tilt", "vehicle.max_slope_deg 20", "world.up") if fact not in facts["reason"]
+    ] == []
 
 
 WALLS = {
