@@ -24,7 +24,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field
-from operator import index
+from operator import index, methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,10 +123,13 @@ class StereoPair:
         vehicle = {} if source.vehicle is None else {"vehicle": source.vehicle.model_dump(mode="json")}
         return config.merge(vehicle, config.expand(source.defaults))
 
+    def _bundle(self, camera: str) -> Bundle:
+        return _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
+
     def _image(self, camera: str) -> xarray.DataArray:
         import xarray
 
-        image = _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
+        image = self._bundle(camera)
         valid = image.arrays.get("valid")
         return xarray.DataArray(
             np.array(image["image"]),  # a copy: what a user draws into it must not reach the next step
@@ -182,7 +185,7 @@ def check_sections(settings: Mapping[str, object]) -> None:
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
-    """Match two images of any two cameras, as ``rille match`` does and, of a pair, a run.
+    """Match two images of any two cameras, as ``rille match --dense`` does and, of a pair, a run.
 
     Parameters
     ----------
@@ -195,8 +198,9 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        ``column_disparity``, ``row_disparity``, ``disparity_std`` (pixels, right minus left), ``validity`` (bits) and
-        more, each (row, col) of the left image.
+        ``column_disparity``, ``row_disparity`` (right minus left) and ``disparity_std``, pixels, NaN undefined,
+        ``validity`` (bits) and more, each (row, col) of the left image. Gaps along rows are filled: of ``validity`` the
+        bit 1 is set where a pixel was matched, 2 where it was interpolated.
 
     Raises
     ------
@@ -283,7 +287,8 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     -------
     xarray.Dataset
         ``position`` (point, xyz), ``sigma_along`` and ``sigma_across`` (point), standard deviations along and across
-        the ray, m, ``colour`` (point, rgb) and ``pixel`` (point, uv), column and row. Errors of the rig are not in it.
+        the ray, m, without errors of the rig, ``colour`` (point, rgb), 0..255, and ``pixel`` (point, uv), column and
+        row in the left image.
 
     Raises
     ------
@@ -310,13 +315,12 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
         raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
     given = _disparity(disparity, pair)
     found = points_of(given, pair.sequence.rig, int(every))
-    left: Bundle = Bundle({"image": np.asarray(pair.left)}, {})
     return xarray.Dataset(
         {
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
             "sigma_along": ("point", found.sigma_along, {"units": "m"}),
             "sigma_across": ("point", found.sigma_across, {"units": "m"}),
-            "colour": (("point", "rgb"), colours(found.pixel, left)),
+            "colour": (("point", "rgb"), colours(found.pixel, pair._bundle("left"))),
             "pixel": (("point", "uv"), found.pixel, {"units": "px"}),
         }
     )
@@ -366,6 +370,8 @@ def terrain(
         Nothing is matched, or the pair shows no ground and nothing else is wanted.
     InputError
         The disparity is not that of an image of this size.
+    ConfigError
+        A parameter is unknown, or not permitted.
 
     Examples
     --------
@@ -411,7 +417,15 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     Returns
     -------
     xarray.Dataset
-        ``risk`` (0 safe, 1 caution, 2 hazard, 3 unknown), ``p_hazard``, ``reason`` (bits) and the measures.
+        ``risk`` (0 safe, 1 caution, 2 hazard, 3 unknown), ``p_hazard``, ``reason`` (bits) and the measures, metres and
+        radians, each (row, col).
+
+    Raises
+    ------
+    InputError
+        The dataset is not that of :func:`terrain`, or its elevations are distances from a plane that is no ground.
+    ConfigError
+        A limit or parameter is unknown, or not permitted.
 
     Examples
     --------
@@ -434,6 +448,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
         read = config.read_toml(Path(vehicle))
         limits = read.get("vehicle", read)
     elif vehicle is not None:
+        check_sections({"vehicle": vehicle})
         limits = dict(vehicle)
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
     built: Any = config.build(settings)
@@ -472,6 +487,8 @@ def path(
     ------
     InputError
         Goal or start lies outside the map, in a hazard or on unknown ground.
+    ConfigError
+        A parameter is unknown, or not permitted.
 
     Examples
     --------
@@ -533,8 +550,8 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
 
 
 def _carried(meta: Settings, settings: Settings) -> dict[str, str]:
-    # A setting may be a number of NumPy.
-    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)}, default=np.generic.item)}
+    # A setting may be a number or an array of NumPy.
+    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)}, default=methodcaller("tolist"))}
 
 
 def _settings(data: Any) -> dict[str, Any]:

@@ -24,7 +24,7 @@
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
     wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
-    leaves:  accuracy (trajectory, crosscheck), position_accuracy, dem_accuracy (local and merged DEM), path_check
+    leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
 Frames that show no motion (black, of another scene, left and right exchanged) are lost: ``frame_screening`` finds them

@@ -49,7 +49,7 @@ class Readings(NamedTuple):
     """Readings of the sensors at each frame.
 
     ``up`` (frame, 3) direction of up in the left camera; ``acceleration`` (frame,) m/s2; ``odometry`` (frame, 3) x, y
-    (m), heading (rad) by the wheels since the first frame.
+    (m), heading (rad) by the wheels, less those of the first frame.
     """
 
     up: Floats
@@ -121,14 +121,6 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float) -> str:
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
 
 
-def _relative(wheels: Floats) -> Floats:
-    """Readings (frame, 3) since the first of them."""
-    x, y = (wheels[:, k] - wheels[0, k] for k in (0, 1))
-    # Into the frame of the first reading: turned back by its heading.
-    c, s = math.cos(wheels[0, 2]), math.sin(wheels[0, 2])
-    return np.stack([c * x + s * y, c * y - s * x, wheels[:, 2] - wheels[0, 2]], axis=1)
-
-
 @stage("fault_monitor")
 def fault_monitor_stage(
     params: NoParams,
@@ -143,7 +135,7 @@ def fault_monitor_stage(
     # Of the readings, those frames that were resected.
     wheels = np.asarray(sense["odometry"])[rows]
     verdict = judge(
-        Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], _relative(wheels)),
+        Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], wheels - wheels[0]),
         np.asarray(resect["poses"]),
         [int(f["inliers"]) for f in resect.meta["per_frame"]],
         T_vehicle_left,

@@ -39,10 +39,10 @@ class PathParams(Params):
     """Parameters of ``path``. ``start`` and ``target`` concern the path over the whole map, not those of each stop."""
 
     start: Point | None = Field(
-        default=None, description="start x, y in the world frame [m]; null: within a vehicle's length of the first row"
+        default=None, description="start x, y, world frame [m]; not set: within a vehicle's length of the first row"
     )
     target: Point | None = Field(
-        default=None, description="target x, y in the world frame [m]; null: as far as rows or connected ground lead"
+        default=None, description="target x, y, world frame [m]; not set: as far as rows or connected ground lead"
     )
     planner: Planner = Field(
         default="auto",
@@ -101,10 +101,7 @@ class PathMaps:
         self.lattice, risk = lattice, maps["risk"]
         chance = maps["p_hazard"] if "p_hazard" in maps else np.zeros(1, np.float32)
         self.stand = window_mean(maps["elevation"], window_cells(vehicle.wheel_diameter, lattice.cell))
-        # A limit of 1 is none, even where rounding lifts a probability above it.
-        self.closed = (risk >= HAZARDOUS) | (
-            chance > np.float32(params.p_certain_hazard if params.p_certain_hazard < 1 else np.inf)
-        )
+        self.closed = (risk >= HAZARDOUS) | (chance > np.float32(params.p_certain_hazard))
         # Smaller height differences cost nothing.
         step = 0.02 * vehicle.max_step
         steps = np.rint(np.where(self.closed, np.float32(0), self.stand) / np.float32(step))

@@ -173,6 +173,16 @@ def test_distortion_is_not_taken_off_twice(tmp_path, places, more, rectified):
     assert any("RIL-817" in line for line in s.warnings) == (rectified and not more)
 
 
+@pytest.mark.parametrize(("baseline", "told"), [(0.1, False), (0.1005, False), (0.102, True), (0.098, True)])
+def test_another_baseline_than_that_of_the_calibration_is_told(tmp_path, baseline, told):
+    for k, side in enumerate(("left", "right")):
+        (tmp_path / f"{side}.yaml").write_text(INFO.format(shift=-5.5 * k))
+    cameras = '[cameras]\nleft = "left.yaml"\nright = "right.yaml"\n'
+    s = opened(write_sequence(tmp_path, cameras=cameras, rig=f"[rig]\nbaseline = {baseline}\n"))
+    assert s.rig.baseline == pytest.approx(baseline)
+    assert any("RIL-693" in line for line in s.warnings) == told
+
+
 def test_a_distortion_without_projection_is_refused(tmp_path):
     path = write_sequence(tmp_path, cameras=CAMERAS + "distortion = [-0.3, 0.1, 0, 0]\n")
     path.write_text(path.read_text().replace("[images]", "[images]\nrectified = true"))

@@ -149,6 +149,25 @@ def test_the_vehicle_may_be_a_file(dem: Any, tmp_path: Path) -> None:
 def test_settings_may_be_numbers_of_numpy(disparity: Any, pair: rille.StereoPair) -> None:
     dem = rille.terrain(disparity, pair, cell_size=np.float32(0.0078125))
     assert json.loads(dem.attrs["rille"])["settings"]["locus"]["cell_size"] == 0.0078125
+    plane = [0.0, 0.0, -1.0, 0.0, 0.0, 0.5]
+    one, other = (rille.terrain(disparity, pair, reference=given, cell_size=0.01) for given in (plane, np.array(plane)))
+    np.testing.assert_array_equal(one.elevation, other.elevation)
+
+
+def test_points_have_the_colours_of_the_left_image(pair: rille.StereoPair, disparity: Any, tmp_path: Path) -> None:
+    import cv2
+
+    grey = np.asarray(pair.left)
+    cv2.imwrite(str(tmp_path / "left.png"), np.stack([grey // 2, grey // 3, grey], axis=2))  # blue, green, red
+    cv2.imwrite(str(tmp_path / "right.png"), np.asarray(pair.right))
+    (tmp_path / "m.toml").write_text(
+        '[images]\nleft = "left.png"\nright = "right.png"\n[cameras]\nfx = 300.0\ncx = 142.0\ncy = 129.5\n'
+        "[rig]\nbaseline = 0.1\n"
+    )
+    cloud = rille.points(disparity, rille.open(tmp_path / "m.toml")[0], every=5)
+    column, row = cloud.pixel.values.T
+    there = grey[row, column]
+    np.testing.assert_array_equal(cloud.colour, np.stack([there, there // 3, there // 2], axis=1))
 
 
 def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: Any, dem: Any) -> None:
@@ -177,6 +196,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         rille.terrain(disparity.isel(row=slice(5)), pair)
     with raises("RIL-027", "hfvm.no"):
         rille.match(pair.left, pair.right, no=1)
+    with raises("RIL-861", "vehicle=3"):
+        rille.hazards(dem, vehicle=3)
     with raises("RIL-027", "vehicle.wings"):
         rille.hazards(dem, vehicle={"wings": 2})
 

@@ -24,7 +24,7 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = _OPTIONS) ->
     Parameters
     ----------
     seq
-        A name from `rille datasets`, a folder whose layout is recognised, a manifest, or an RO-Crate of a run
+        A name from `rille datasets list`, a folder whose layout is recognised, a manifest, or an RO-Crate of a run
         (`rille export`), which is run again from its sequence and compared.
     more
         Others, which follow one after another.

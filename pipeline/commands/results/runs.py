@@ -42,8 +42,8 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             statuses = Counter(row["status"] for row in rows)
             missing = statuses["failed"] + statuses["skipped"]
             # "ok": all tasks have ended; "total": the files and the report are written, too.
-            whole = "interrupted" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
-            state = "interrupted" if "ok" not in facts else f"{missing} missing" if missing else whole
+            whole = "unfinished" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
+            state = "unfinished" if "ok" not in facts else f"{missing} missing" if missing else whole
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
             seconds = facts.get("total", facts.get("seconds"))
             took = "" if seconds is None else f"{seconds:.1f}"

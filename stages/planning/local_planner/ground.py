@@ -128,7 +128,7 @@ class Ground:
         opened = gaps.proven > np.where(near, self.here[2], margin) - slack
         for cx, cy in self.closed:
             # Where looking did not help, unknown ground is closed; known ground in the circle may be driven.
-            opened &= known | (np.hypot(x - cx, y - cy) > CLOSED_WHEELBASES * self.vehicle.wheel_base)
+            opened &= np.hypot(x - cx, y - cy) > CLOSED_WHEELBASES * self.vehicle.wheel_base
         return known, opened | known
 
     def _away(self, x: Floats, y: Floats) -> Floats:

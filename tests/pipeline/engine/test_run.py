@@ -260,9 +260,10 @@ def test_input_output_errors_are_tried_three_times_others_once(cache, tmp_path, 
     _, result = run(cache, make=mischief("disk", tally=str(tmp_path / "disk")))
     assert result.ok
     assert (tmp_path / "disk").read_text() == "xxx"
-    _, result = run(cache, make=mischief("value", tally=str(tmp_path / "value")))
-    assert not result.ok
-    assert (tmp_path / "value").read_text() == "x"
+    for what in ("value", "missing"):
+        _, result = run(cache, make=mischief(what, tally=str(tmp_path / what)))
+        assert not result.ok
+        assert (tmp_path / what).read_text() == "x"
 
 
 def test_a_flow_that_fails_is_a_failure_and_one_that_cannot_go_on_is_noted(cache, tmp_path):

@@ -130,6 +130,7 @@ def test_an_artifact_is_one_file_that_any_reader_of_zip_files_finds_sound(cache)
         assert archive.testzip() is None
         assert {"zarr.json", "elevation/zarr.json", "elevation/c.0.0"} <= set(archive.namelist())
         assert {m.compress_type for m in archive.infolist()} == {zipfile.ZIP_STORED}
+        assert {m.date_time for m in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, "equal results make equal files"
         assert json.loads(archive.read("manifest.json"))["digest"] == ref.digest
     assert ref.stored == (cache / ref.path).stat().st_size
 

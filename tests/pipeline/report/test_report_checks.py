@@ -87,9 +87,10 @@ def test_overlapping_models_and_the_choice_of_pairs_are_tabled(self_checked: Wri
     first, second = facts["pairs"]
     assert (first["overlap"], first["why_basic"], first["difference_m"]) == (None, "first frame", None)
     assert (second["overlap"], second["why_basic"], second["epipolar_px"]) == (0.72, "overlap", 0.6)
-    assert second["difference_m"] == pytest.approx(0.003, abs=1e-6)
+    assert second["difference_m"] == pytest.approx(-0.003, abs=1e-6)
     assert second["difference_deviation_m"] == pytest.approx(0.0, abs=1e-6)
     assert facts["metrics"]["overlap_median"]["value"] == pytest.approx(0.003, abs=1e-6)
+    assert facts["metrics"]["path_inclination"]["value"] == pytest.approx(np.degrees(0.1))
 
 
 def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:

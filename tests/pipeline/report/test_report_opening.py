@@ -250,3 +250,16 @@ def test_the_profile_shows_the_inclination_that_was_judged():
     assert found[0] == [*path[0], round(float(np.degrees(inclination[2, 3])), 2)]
     assert [row[3] for row in found[1:]] == [None, None]
     assert terrain_map._path(SimpleNamespace(path=None, risk=None)) == []
+
+
+@pytest.mark.parametrize(("outside", "unsure", "told"), [(0.06, 0.05, True), (0.05, 0.04, False), (0.3, 0.0, True)])
+def test_of_the_pair_whose_map_lacks_most_it_is_told_what_brings_that_in(outside, unsure, told):
+    def lacking(*shares):
+        facts = dict(zip(("outside", "unsure"), shares, strict=True)) | {"settings": {"locus.max_sigma": 0.02}}
+        return SimpleNamespace(meta={"coverage": facts | {"size": [3.0, 40.0]}})
+
+    maps = {0: lacking(0.01, 0.0), 4: lacking(outside, unsure), 8: SimpleNamespace(meta={})}
+    run = SimpleNamespace(products=SimpleNamespace(local_dem=maps), bundle=lambda handle: handle)
+    lines = delivery.coverage(run)
+    assert len(lines) == told
+    assert all("pair 4" in line and "--set locus.max_sigma=0.02" in line for line in lines)

@@ -20,7 +20,7 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     chain.build(graph)
     options = driver.RunOptions(executor="inline", ledger=run / lookup.LEDGER)
     driver.run(graph, Store(tmp_path / "cache"), options)
-    assert [line.split()[1] for line in runs.describe([run])] == ["state", "interrupted"]
+    assert [line.split()[1] for line in runs.describe([run])] == ["state", "unfinished"]
     events.add_facts(run / lookup.LEDGER, total=1.0)
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "complete"]
 

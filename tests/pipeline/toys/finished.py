@@ -136,7 +136,7 @@ def bundles() -> dict[str, Bundle]:
     column[:4] = np.nan
     validity = np.where(np.isfinite(column), 1, 16).astype(np.uint8)
     # The second model lies 3 mm above the first.
-    made["seams4"] = Bundle({}, {"pair": 4, "seams": [{"pair": 4, "other": 0, "bias": 0.003, "noise": 0.0}]})
+    made["seams4"] = Bundle({}, {"pair": 4, "seams": [{"pair": 4, "other": 0, "bias": -0.003, "noise": 0.0}]})
     for pair in BASIC:
         made[f"disparity{pair}"] = Bundle(
             {"column_disparity": column, "row_disparity": 0.1 * column, "validity": validity}, {}

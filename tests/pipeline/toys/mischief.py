@@ -33,6 +33,8 @@ def _run(params, args, inputs):
         raise UnpicklableError(1, 2)
     if what == "disk" and count < 3:
         raise OSError(5, "Input/output error")
+    if what == "missing":
+        raise FileNotFoundError(2, "No such file or directory", "left/000003.png")
     if what == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     if what == "sleep":

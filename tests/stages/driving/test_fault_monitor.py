@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rille.stages.driving.fault_monitor import Readings, Verdict, judge
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.driving.fault_monitor import Readings, Verdict, fault_monitor_stage, judge
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 OPTICAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -95,6 +96,26 @@ def test_a_heading_that_the_wheels_do_not_know_stops() -> None:
     found = judged(**leg(turn=math.radians(3.0)))
     assert (found.stop, found.kind) == (3, "slip")
     assert "9.0 degrees" in found.reason
+
+
+def test_wheels_count_turns_on_where_headings_begin_anew() -> None:
+    given = leg(turn=1.0)
+    given["odometry"][:, 2] = np.arange(5)
+    assert judged(**given).stop is None
+
+
+def test_readings_are_taken_from_the_first_image_on() -> None:
+    given, heading = leg(turn=0.05), 2.0
+    ways = given["odometry"] + [0.3 * STEP, 0.0, 0.05] * np.arange(5)[:, None]
+    given["odometry"] = ways @ rotation_exp([0, 0, heading]).T + [5.0, -3.0, heading]
+    moved = [RigidTransform(rotation_exp([0, 0, z]), np.array([x, y, 0])) @ T_VEHICLE_LEFT for x, y, z in ways]
+    facts = [{"frame": 7 + k, "inliers": 99} for k in range(5)]
+    resect = Bundle({"poses": np.array([T.matrix34 for T in moved])}, {"per_frame": facts})
+    args = {"rows": list(range(5)), "T_vehicle_left": T_VEHICLE_LEFT.to_list(), "vehicle": VEHICLE}
+    sense = Bundle({name: given[name] for name in ("up", "acceleration", "odometry")}, {})
+    assert fault_monitor_stage.run(NoParams(), args, {"sense": sense, "resect": resect}).meta["stop"] is None
+    sense.arrays["odometry"][3, :2] -= 0.5 * (given["odometry"][3, :2] - given["odometry"][0, :2])
+    assert fault_monitor_stage.run(NoParams(), args, {"sense": sense, "resect": resect}).meta["frame"] == 10
 
 
 def test_a_vehicle_that_lies_upside_down_stops() -> None:

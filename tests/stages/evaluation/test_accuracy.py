@@ -207,6 +207,10 @@ def test_a_scale_of_a_percent_is_a_percent() -> None:
     figure = trajectory_accuracy(true * [1.0, 1.0, 1.0, 1.01], true)[1]["scale_error"]
     assert figure["value"] == pytest.approx(1.0)
     assert trajectory_accuracy(rest, rest)[1]["scale_error"]["value"] is None
+    rng, noisy = np.random.default_rng(1), true.copy()
+    noisy[:, :, 3] += np.cumsum(rng.normal(scale=0.01, size=(41, 3)), axis=0)
+    how = trajectory_accuracy(noisy, true)[1]["scale_error"]["how"]
+    assert float(how.partition("+- ")[2].split(";")[0]) == pytest.approx(100 * 0.01 / (0.5 * 40**0.5), rel=0.15)
 
 
 def test_right_claims_give_one_and_halved_deviations_four() -> None:
@@ -216,8 +220,9 @@ def test_right_claims_give_one_and_halved_deviations_four() -> None:
     claimed = 1e-4 * (base @ base.T + np.eye(6))
     errors = rng.multivariate_normal(np.zeros(6), claimed, n)
     estimate, true = np.tile(np.eye(3, 4), (n, 1, 1)), np.tile(np.eye(3, 4), (n, 1, 1))
+    estimate[:, :, :3] = true[:, :, :3] = rotation_exp([0.3, -1.0, 2.0])  # errors are of the world's axes
     true[1:, :, 3] = errors[1:, :3]
-    true[1:, :, :3] = [rotation_exp(e) for e in errors[1:, 3:]]
+    true[1:, :, :3] = [rotation_exp(e) @ true[0, :, :3] for e in errors[1:, 3:]]
     covariance = np.tile(claimed, (n, 1, 1))
     covariance[0] = 0.0
     value = nees(estimate, true, covariance)

@@ -7,7 +7,16 @@ import pytest
 from raising import raises
 
 from rille.stages.evaluation import dem_comparison
-from rille.stages.evaluation.dem_comparison import Alignment, align, binned, cell_means, common, errors, figures
+from rille.stages.evaluation.dem_comparison import (
+    Alignment,
+    align,
+    binned,
+    cell_means,
+    common,
+    errors,
+    figures,
+    relief_factor,
+)
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.terrain.relief.grid import Grid
 
@@ -179,6 +188,20 @@ def test_a_motion_that_the_terrain_does_not_show_is_refused() -> None:
     few = Grid(np.where(rng.random((50, 60)) < 0.002, 1.0, np.nan), flat.matrix)
     with raises("RIL-325"):
         align(few, flat, "tilt")
+
+
+def test_what_lies_higher_errs_upwards_moved_or_not() -> None:
+    b = terrain()
+    a = Grid(b.values + 0.5, b.matrix)
+    for found in (errors(a, b), errors(a, b, RigidTransform.identity())):
+        np.testing.assert_allclose(found[np.isfinite(found)], 0.5)
+
+
+def test_a_factor_is_that_of_the_reference_and_none_where_reliefs_are_unlike() -> None:
+    b, noise = terrain(), np.random.default_rng(1).normal(size=(80, 100))
+    leaning = Grid(2 * b.values + 50 + 0.1 * b.centres()[..., 0], b.matrix)
+    assert relief_factor(leaning, b) == pytest.approx(2.0)
+    assert relief_factor(Grid(b.values + noise, b.matrix), b) == 1.0
 
 
 def test_bins_leave_out_what_is_empty() -> None:

@@ -126,6 +126,28 @@ def test_a_single_wrong_cell_on_fine_ground_is_no_rock_but_a_coarse_post_is() ->
     assert (judge(z, cell=0.1, vehicle=DEFAULT_VEHICLE)["risk"] == HAZARDOUS).sum() >= 9
 
 
+def test_hidden_ground_makes_no_hazard_less_certain() -> None:
+    """Behind a step of 20 mm, where 15 mm are permitted, the ground is hidden or seen."""
+    z = np.zeros((120, 200))
+    z[:, 100:] = 0.02
+    hidden = z.copy()
+    hidden[:, 105:] = np.nan
+    seen, half = (judge(ground, std=0.002) for ground in (z, hidden))
+    near = np.s_[55:65, 100:105]
+    assert (seen["risk"][near] == HAZARDOUS).all()
+    assert (half["risk"][near] == HAZARDOUS).all()
+    assert (half["p_hazard"][near] >= seen["p_hazard"][near]).all()
+
+
+def test_a_cell_that_the_vehicle_can_only_reach_over_hidden_ground_says_so() -> None:
+    z = np.zeros((200, 300))
+    z[:, :100] = np.nan
+    unseen = (judge(z)["reason"][100] & UNSEEN_BIT) > 0
+    # The middle within half a wheel base of it; the wheel's window alone ends at 15 cells.
+    assert unseen[100:140].all()
+    assert not unseen[190:220].any()
+
+
 def test_unknown_does_not_grow_and_what_is_near_it_is_not_called_safe() -> None:
     z = np.zeros((250, 300))
     z[:, :60] = np.nan

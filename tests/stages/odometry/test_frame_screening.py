@@ -122,6 +122,10 @@ def test_frames_whose_left_image_is_of_another_time_are_lost_beside_frames_that_
     assert "not of one time (35%" in out.lost[3]
     # a rig that fits no frame speaks against itself, not against a frame
     assert not found({}, jumps=[3], sides=dict.fromkeys((2, 3, 4), apart)).lost
+    half, least = apart | {"as_given": 0.59}, apart | {"as_given": 0.1}
+    assert not found({}, jumps=[3], sides={2: half, 3: least, 4: half}).lost
+    # nor does one that fits somewhat less
+    assert not found({}, jumps=[3], sides={2: fits, 3: fits | {"as_given": 0.6}, 4: fits}).lost
 
 
 def test_one_exchanged_frame_stands_out_among_six():

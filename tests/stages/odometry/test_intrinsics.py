@@ -18,6 +18,7 @@ from rille.stages.odometry.resection.intrinsics import (
     SegmentCameras,
     calibrated_anew,
     common_errors,
+    composed,
     contribution,
     corrected,
     intrinsics_stage,
@@ -186,3 +187,10 @@ def test_segments_that_scatter_by_more_than_they_claim_widen_the_error():
     common = common_errors(information, 1e6 * value, np.ones(k))
     assert np.sqrt(np.diag(common.covariance)) == pytest.approx(np.full(k, 0.003 / 20.0), rel=0.15)
     assert (np.abs(common.errors) < 4.0 * 0.003 / 20.0).all()
+
+
+def test_two_corrections_one_after_the_other_are_one():
+    first, second = np.array([0.1, 0.02, -0.03, 0.01]), np.array([-0.05, 0.01, 0.02, -0.004])
+    camera = Camera(450.0, 430.0, 375.5, 239.5, 752, 480)
+    twice, once = corrected(corrected(camera, first), second), corrected(camera, composed(first, second))
+    np.testing.assert_allclose(twice.matrix, once.matrix, rtol=1e-12)

@@ -78,10 +78,22 @@ def test_a_part_that_is_repeated_elsewhere_is_no_loop() -> None:
     assert "parts of the image" in out.meta["refused"][0]["reason"]
 
 
-def test_the_same_picture_at_another_size_is_no_loop() -> None:
-    out = compared(pair(picture(1), AGAIN, size=1.3), FIRST)
+@pytest.mark.parametrize(("size", "why"), [(1.3, "times as far"), (1.08, "both directions depart")])
+def test_the_same_picture_at_another_size_is_no_loop(size: float, why: str) -> None:
+    out = compared(pair(picture(1), AGAIN, size=size), FIRST)
     assert not out.meta["factors"]
-    assert "times as far" in out.meta["refused"][0]["reason"]
+    assert why in out.meta["refused"][0]["reason"]
+
+
+def test_both_directions_are_joined_and_as_uncertain_as_they_disagree() -> None:
+    spread = []
+    for size in (1.0, 1.05):
+        again = pair(picture(1), AGAIN, size=size)
+        there, back = (compared(*pairs).meta["factors"][0] for pairs in ((again, FIRST), (FIRST, again)))
+        around = RigidTransform.from_matrix(there["pose"]) @ RigidTransform.from_matrix(back["pose"])
+        assert np.linalg.norm(around.translation) < 1e-4
+        spread.append(np.sqrt(there["covariance"][0]))
+    assert spread[1] > 2 * spread[0]
 
 
 def test_a_pattern_without_end_is_no_loop() -> None:

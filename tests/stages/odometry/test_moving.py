@@ -105,6 +105,11 @@ def test_a_board_that_is_pushed_aside_is_found_and_little_beside_it(back: bool) 
     assert not (mask & ~near).any()
 
 
+def test_a_departure_is_what_the_distance_leaves_unexplained() -> None:
+    disparity, motion, _ = given(0.0)
+    assert np.nanmedian(departures(disparity, motion, RIG, T_B_A, back=False)) < 0
+
+
 def test_where_nothing_is_known_nothing_moves() -> None:
     disparity, motion, segment = given(0.5)
     unknown = Bundle({**motion.arrays, "validity": np.zeros_like(motion["validity"])}, motion.meta)

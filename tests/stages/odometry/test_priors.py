@@ -7,7 +7,7 @@ from test_adjust import errors, run_of
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.resection.adjust import adjust_stage
-from rille.stages.odometry.resection.sensors import departure, resampled
+from rille.stages.odometry.resection.sensors import OwnTrajectory, RelativePrior, departure, resampled
 
 TIMES = 0.1 * np.arange(31)
 BASE = {"times": TIMES.tolist(), "timed": True, "georeferenced": True}
@@ -129,6 +129,35 @@ WRONG = {
         ("lever_arm",),
     ),
 }
+
+
+def test_later_poses_lie_ahead():
+    poses = np.tile(np.eye(3, 4), (31, 1, 1))
+    poses[:, 0, 3] = 2 * TIMES
+    np.testing.assert_allclose(resampled(poses, TIMES, 0.25)[:28, 0, 3], 2 * TIMES[:28] + 0.5)
+    assert np.isnan(resampled(poses, TIMES, 0.25)[28:]).all()
+
+
+def test_positions_without_heights_leave_the_heights_to_the_camera():
+    truth, rng = winding(), np.random.default_rng(9)
+    steep = [RigidTransform(T.rotation, T.translation + 0.01 * k**2 * np.eye(3)[2]) for k, T in enumerate(truth)]
+    segments, before = run_of(steep, rng)
+    given = gnss(steep, rng, sigma=0.1)
+    given["positions"]["positions"] = [place[:2] for place in given["positions"]["positions"]]
+    out = adjusted(segments, before, given)
+    assert out.meta["priors"]["positions"]["left_out"] < 4
+    assert np.abs(errors(out, steep)[:, 2]).max() < 0.3
+
+
+@pytest.mark.parametrize(("stated", "contradicts"), [(0.1, False), (0.001, True)])
+def test_a_turn_that_is_stated_leads_ways_aside(stated, contradicts):
+    heading = 0.1 * np.arange(64)
+    turned = np.array([[[np.cos(a), -np.sin(a), 0, 0], [np.sin(a), np.cos(a), 0, 0], [0, 0, 1, 0]] for a in heading])
+    turned[1:, :, 3] = np.cumsum(turned[:-1, :, 1], axis=0)
+    straight = np.tile(np.eye(3, 4), (64, 1, 1))
+    straight[:, 1, 3] = np.arange(64)
+    own = OwnTrajectory(straight, np.zeros(64, np.int16), np.arange(64.0), np.arange(64))
+    assert bool(RelativePrior(turned, None, 0.02, stated).contradiction(own)) == contradicts
 
 
 def test_degrees_of_latitude_are_named():

@@ -484,17 +484,17 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
         assert f"{(column or row):+.1f} px in the" in line
 
 
-def with_a_lorry(beside, before, moved_ahead=0.5):
-    """Segment of three frames: landmarks of a scene 10 to 60 m ahead, ``beside`` many, and ``before`` many of a board
-    8 m ahead that drives along, over the middle 40 % of the image."""
+def with_a_lorry(beside, before, farthest=60):
+    """Segment of three frames: landmarks of a scene 10 m ahead to the ``farthest``, ``beside`` many, and ``before``
+    many of a board 8 m ahead that drives along, over the middle 40 % of the image."""
     rng = np.random.default_rng(31)
     steps = [RigidTransform(rotation_exp([0, 0.004 * k, 0]), np.array([0.0, 0, 0.6 * k])) for k in range(3)]
     pixels = rng.uniform((40, 40), (CAMERA.width - 40, CAMERA.height - 40), (6 * beside, 2))
     middle = np.abs(pixels[:, 0] - CAMERA.cx) < 0.2 * CAMERA.width
-    far = CAMERA.rays(pixels[~middle][:beside]) * rng.uniform(10, 60, (beside, 1))
+    far = CAMERA.rays(pixels[~middle][:beside]) * rng.uniform(10, farthest, (beside, 1))
     board = CAMERA.rays(pixels[middle][:before]) * 8.0
     points = np.stack(
-        [seen(T, np.concatenate([far, board + np.array([0, 0, moved_ahead * k])])) for k, T in enumerate(steps)], 1
+        [seen(T, np.concatenate([far, board + np.array([0, 0, 0.5 * k])])) for k, T in enumerate(steps)], 1
     ).astype(np.float32)
     return segment_poses(points, np.concatenate([far, board]), RigidTransform.identity(), [4, 5, 6])[1], steps
 
@@ -508,3 +508,8 @@ def test_the_scene_beside_and_behind_a_vehicle_tells_the_motion_even_where_it_sh
         assert 0.9 * before <= found.facts[k]["moving"] <= before
         assert "contradiction" not in found.facts[k]
     assert found.inlier[beside:, 1:].mean() < 0.1
+
+
+def test_a_scene_that_ends_where_the_vehicle_is_does_not_tell_the_motion():
+    found, _ = with_a_lorry(70, 30, farthest=11)
+    assert "two motions" in found.facts[1]["lost"]

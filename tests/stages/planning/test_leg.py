@@ -253,6 +253,24 @@ def test_a_kept_piece_that_begins_on_unknown_ground_is_not_known_to_its_end() ->
     assert [(piece.known, piece.length) for piece in there.again(onward)[0]] == [(False, pytest.approx(0.4))]
 
 
+def test_a_kept_way_back_costs_as_much_as_a_new_one() -> None:
+    there = Ground(ground(), START, 0.0, P)
+    ways = (through(np.array([START, (0.0, 0.1 * gear)]), np.array([gear], np.int8), 0.0) for gear in (1, -1))
+    ahead, back = (there.again(way)[1] for way in ways)
+    assert back == pytest.approx(Ground.reverse_cost * ahead)
+
+
+def test_a_metre_close_to_uncertain_ground_costs_more() -> None:
+    careful, way = ROVER.model_copy(update={"margin": 0.03}), through(np.array([START, GOAL]), AHEAD[:1], 0.0)
+    uncertain = np.full(LATTICE.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
+
+    def cost(aside: float) -> float:
+        risk = np.where(aside < X, np.uint8(HAZARDOUS), np.uint8(SAFE))
+        return Ground(Footing.of(Hazards(risk, uncertain), LATTICE, careful), START, 0.0, P).again(way)[1]
+
+    assert 1.1 * cost(0.2) < cost(0.05) < cost(0.041)
+
+
 def judged(hazardous: np.ndarray, chance: float) -> Bundle:
     risk = np.where(hazardous, np.uint8(HAZARDOUS), np.uint8(SAFE))
     maps = {"risk": risk, "reason": np.where(hazardous, np.uint16(REASONS["step"]), np.uint16(0))}

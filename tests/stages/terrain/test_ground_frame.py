@@ -149,8 +149,11 @@ def test_without_ground_the_pair_is_levelled_all_the_same() -> None:
     assert facts["plane"] is facts["footprint"] is None
     T = RigidTransform.from_matrix(facts["T_local_left"])
     np.testing.assert_allclose(T.rotation, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
-    # The wall stands a metre ahead: a pixel covers 2 m / f at twice that.
-    assert facts["cell_size"] == pytest.approx(2.0 / RIG.left.fx, rel=0.6)
+    # A pixel covers 2 mm at twice the distance of the nearer of two walls.
+    near = 0.001 * RIG.left.fx
+    walls = box((-9.0, near, -9.0), (0.0, 9.0, 9.0)), box((-9.0, 4 * near, -9.0), (9.0, 9.0, 9.0))
+    seen = level(*disparity(RIG, pitched(0.0), nearest(*walls)), RIG, PARAMS)
+    assert seen["cell_size"] == pytest.approx(0.002)
     assert level(*wall, RIG, PARAMS, VerticalHint(up=[0.0, -1.0, 0.1]))["source"] == "attitude"
 
     stated = level(*wall, RIG, PARAMS.model_copy(update={"reference_height": 0.3}))

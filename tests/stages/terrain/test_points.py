@@ -56,6 +56,9 @@ def test_sigma_is_what_an_error_of_the_disparity_along_the_epipolar_line_moves()
         moved.arrays[name] = values
     shift = np.linalg.norm(points(moved, RIG, every=7).position - X, axis=1)
     np.testing.assert_allclose(found.sigma_along, 0.2 * shift / 1e-4, rtol=2e-3)
+    # Across the ray: a point that lies anywhere in its pixel, whose side is the shorter focal length's.
+    within = np.linspace(-0.5, 0.5, 10001).std() / LEFT.fy
+    np.testing.assert_allclose(found.sigma_across, within * np.linalg.norm(X, axis=1), rtol=1e-3)
 
 
 def test_covariance_is_longest_along_the_ray():
