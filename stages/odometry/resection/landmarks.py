@@ -24,7 +24,8 @@ from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
 
 MAX_DISPARITY_STEP_PX = 1.0
-"""Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
+"""Pixels: neighbours whose disparities differ by more than those of one plane lie on two surfaces; also the bound of
+back-matching (4.3.3)."""
 MAX_RELATIVE_SIGMA = 0.2
 """Largest standard deviation of a landmark's distance over the distance; beyond, depth is no longer normal though
 disparity is, and first-order covariances are wrong."""
@@ -85,7 +86,7 @@ def landmarks_of(
     """
     offset, matched = matches_at(points, disparity)
     right = points + offset
-    sigma = np.hypot(disparity_sigma, relief(points, disparity))
+    sigma = np.hypot(disparity_sigma, template_planes(points, disparity)[1])
     landmarks = triangulated(points, right, rig, T_local_left, sigma)
     depth = T_local_left.inverse().apply(landmarks.position)[:, 2]
     off, _ = distances(rig, np.zeros(len(NAMES)), points, right)
@@ -128,21 +129,24 @@ def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
     corners = np.stack([np.asarray(disparity[n])[y4, x4] for n in ("column_disparity", "row_disparity")], -1)
     good = inside & (is_matched(validity[y4, x4]) & np.isfinite(corners).all(-1)).all(1)
     corners = np.where(good[:, None, None], corners, 0.0).astype(np.float64)
-    # Between two surfaces an interpolated disparity is that of neither.
-    apart = np.ptp(corners, axis=1)
+    # Between two surfaces an interpolated disparity is that of neither. On one that is steep in disparity, as ground is
+    # to low cameras far from each other, or to a right one of finer pixels, neighbours differ by what its plane says.
+    on_plane = np.stack([x4, y4], -1) @ template_planes(points, disparity)[0]
+    apart = np.minimum(np.ptp(corners, axis=1), np.ptp(corners - on_plane, axis=1))
     return np.einsum("nk,nki->ni", weights, corners), good & (apart <= MAX_DISPARITY_STEP_PX).all(1)
 
 
-def relief(points: Floats, disparity: Bundle) -> Floats:
-    """Relief under each template: RMS (n,) of the disparities about their plane, pixels.
+def template_planes(points: Floats, disparity: Bundle) -> tuple[Floats, Floats]:
+    """Planes of the disparities under each template: slopes (n, 2, 2) along columns and rows, pixels a pixel, 0 where
+    nothing tells them; and the relief, the RMS (n,) of the disparities about them, pixels.
 
     A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
-    the track are then uncertain by the relief inside the template. NaN where that is beyond
+    the track are then uncertain by the relief inside the template. It is NaN where it is beyond
     :data:`MAX_DISPARITY_STEP_PX`, since then there are two surfaces, or where less than half of the template is
     matched.
     """
     if not len(points):
-        return np.zeros(0)
+        return np.zeros((0, 2, 2)), np.zeros(0)
     names = "column_disparity", "row_disparity", "validity"
     inside, windows = windows_at(points, HALF, *(np.asarray(disparity[name]) for name in names))
     column, row, valid = (window.reshape(len(points), -1) for window in windows)
@@ -156,4 +160,5 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)
     rms = np.sqrt((rest**2).sum((1, 2)) / np.maximum(use.sum(1), 1))
-    return np.where((2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX), rms, np.nan)
+    told = (2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX)
+    return plane[:, 1:] / HALF, np.where(told, rms, np.nan)
