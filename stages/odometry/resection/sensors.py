@@ -212,12 +212,13 @@ class RelativePrior:
 
 @dataclass(frozen=True)
 class Fixes:
-    """Positions (k, 3), m, moved to the moments of ``nodes`` (k,); ``antenna`` (k, 3) there by the camera, and its
-    ``velocity`` (k, 3), m/s."""
+    """Positions (k, 3), m, of a frame of their own; ``antenna`` (k, 3) at their moments by the camera, ``behind``
+    (k, 3), m, its way there from the nearest of the ``nodes`` (k,), and its ``velocity`` (k, 3), m/s."""
 
     nodes: NDArray[np.intp]
     positions: Floats
     antenna: Floats
+    behind: Floats
     velocity: Floats
 
 
@@ -247,7 +248,7 @@ class PositionPrior:
         return PositionPrior(np.pad(rows, ((0, 0), (0, lacking))), times, sigma, lever, clocked)
 
     def fixes(self, own: OwnTrajectory, late: float = 0.0) -> Fixes:
-        """Positions at the moments of the nearest nodes, by the camera's own way from the one to the other."""
+        """Positions beside the nearest nodes, and the camera's own way from there to their moments."""
         antenna = own.poses[:, :, 3] + own.poses[:, :, :3] @ self.lever
         at = self.times - late
         after = np.clip(np.searchsorted(own.times, at), 1, len(own.times) - 1)
@@ -257,8 +258,9 @@ class PositionPrior:
         usable = length <= MAX_GAP_STEPS * np.median(np.diff(own.times))
         usable &= (own.piece[after] == own.piece[after - 1]) & (part > -0.5) & (part < 1.5)
         velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
-        positions = self.positions + (own.times[near] - at)[:, None] * velocity
-        return Fixes(near[usable], positions[usable], antenna[near[usable]], velocity[usable])
+        # The antenna is moved, not the position: how the frame of positions is turned is not known yet.
+        behind = (at - own.times[near])[:, None] * velocity
+        return Fixes(*(v[usable] for v in (near, self.positions, antenna[near] + behind, behind, velocity)))
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
@@ -278,7 +280,7 @@ class PositionPrior:
         fixes = self.fixes(own, late)
         count, turns = len(fixes.nodes), own.poses[fixes.nodes, :, :3]
         measured = np.tile(np.eye(3, 4), (count, 1, 1))
-        measured[:, :, 3] = self.laid.apply(fixes.positions)
+        measured[:, :, 3] = self.laid.apply(fixes.positions) - fixes.behind
         root, shared = np.zeros((count, 6, 6)), np.zeros((count, 6, 4))
         root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / self.sigma
         # The arm that is stated less the true one.

@@ -175,6 +175,20 @@ def test_positions_say_where_the_world_lies():
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
 
 
+def test_how_the_frame_of_positions_is_turned_changes_nothing():
+    """Nor where their moments lie between those of the images."""
+    truth, rng = winding(), np.random.default_rng(9)
+    segments, before = run_of(truth, rng)
+    points, between, found = np.array([T.translation for T in truth]), TIMES[:-1] + 0.045, []
+    points = np.stack([np.interp(between, TIMES, axis) for axis in points.T], axis=1)
+    for angle in (0.0, 0.5 * np.pi):
+        given = {"positions": (points @ rotation_exp([0, 0, angle])).tolist(), "times": between.tolist()}
+        given |= {"sigma": [0.05] * 3, "lever": [0.0] * 3}
+        found.append(adjusted(segments, before, {**BASE, "positions": given}))
+        assert not [line for line in found[-1].meta["warnings"] if line.startswith("[")]
+    np.testing.assert_allclose(found[0]["poses"], found[1]["poses"], atol=1e-6)
+
+
 def test_the_vertical_holds_a_chain_upright():
     truth, rng = winding(), np.random.default_rng(7)
     segments, before = run_of(truth, rng)
