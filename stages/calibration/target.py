@@ -131,7 +131,7 @@ def calibrate_rig(
     _enough(used.views)
     # From the first solution, now without the bad views' poses.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
-    _sides(used.rig(x).T_right_left)
+    _sides(used.rig(x))
     final = {r.name: r for r in used.residuals(x)}
     rms, sigma = used.errors(x)
     left, right = used.lenses(x)
@@ -160,9 +160,9 @@ def _undetermined() -> DegenerateError:
     return DegenerateError("RIL-311", "the views do not determine the cameras", remedy=remedy)
 
 
-def _sides(T_right_left: RigidTransform) -> None:
-    x = float(T_right_left.translation[0])
-    if x > SWAPPED * float(np.linalg.norm(T_right_left.translation)):
+def _sides(rig: Rig) -> None:
+    x = -float(rig.centre[0])
+    if x > SWAPPED * rig.baseline:
         raise InputError(
             "RIL-310",
             f"the right camera stands {x:.4g} m to the left of the left one",

@@ -35,8 +35,7 @@ DIFFERENCE_STEP_RAD = 1e-6
 
 def standing(rig: Rig) -> bool:
     """Whether one camera stands above the other: epipolar lines run down the image then, and not along its rows."""
-    centre = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
-    return bool(abs(centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
+    return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
 
 
 def corrected(rig: Rig, correction: Floats) -> Rig:
@@ -179,8 +178,7 @@ def exchanged(as_given: float, other_way: float) -> bool:
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
-    given = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
-    unit = given / np.linalg.norm(given)
+    unit = rig.centre / np.linalg.norm(rig.centre)
     axis = np.array([1.0, 0.0, 0.0]) if standing(rig) else np.array([0.0, 1.0, 0.0])
     across = axis - unit * float(unit @ axis)
     across /= np.linalg.norm(across)
