@@ -260,7 +260,8 @@ class PositionPrior:
         velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
         # The antenna is moved, not the position: how the frame of positions is turned is not known yet.
         behind = (at - own.times[near])[:, None] * velocity
-        return Fixes(*(v[usable] for v in (near, self.positions, antenna[near] + behind, behind, velocity)))
+        there, of = antenna[near] + behind, usable
+        return Fixes(near[of], self.positions[of], there[of], behind[of], velocity[of])
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
