@@ -26,8 +26,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.scale import other_size
-from rille.stages.hfvm import plane
-from rille.stages.hfvm.epipolar import typical
+from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
 from rille.stages.hfvm.level import PyramidPair, State, descend, sample
 from rille.stages.hfvm.native.problem import Map
@@ -218,7 +217,7 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 
     def weigh(off: AnyArray) -> AnyArray:
         # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * typical(off)))
+        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * epipolar.typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
     hold = 1e-3 * target.size * np.eye(len(basis))
@@ -261,6 +260,11 @@ class Coarse:
     ratio: Floats | None = None
     alignment: plane.Matrix | None = None
     prior: PriorDisparities | None = None
+
+    @property
+    def upright(self) -> bool:
+        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
+        return not epipolar.along_rows(self.state.band.f, self.images.left.shapes[0])
 
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""
