@@ -261,7 +261,7 @@ def landing(work: FinestWork, fine: Fine) -> Fine:
 
 def speckles(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels in small isolated patches, most of which are errors."""
-    small = isolated(work.left.u, fine.keep, work.images.params.speckle)
+    small = isolated(work.left.v if work.upright else work.left.u, fine.keep, work.images.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
 
 
