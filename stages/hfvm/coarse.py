@@ -76,14 +76,6 @@ def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
     return PriorDisparities(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
 
 
-def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisparities | None:
-    """The prior towards the aligned right image."""
-    if prior is None or h is None:
-        return prior
-    # Ends that come to lie near the horizon of the plane are led farther than the given ones.
-    return _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
-
-
 def impose(images: PyramidPair, state: State, prior: PriorDisparities | None) -> State:
     """State of the same level with the prior's displacements in both directions where they are known.
 
@@ -321,7 +313,10 @@ def even(coarse: Coarse) -> Coarse:
 
 def known(coarse: Coarse) -> Coarse:
     """Disparities known beforehand in the place of those found."""
-    prior = aligned(coarse.prior, coarse.alignment)
+    prior, h = coarse.prior, coarse.alignment
+    if prior is not None and h is not None:
+        # Ends that come to lie near the horizon of the plane are led farther than the given ones.
+        prior = _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
     return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
 

@@ -236,8 +236,7 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
     keep = fine.keep
     # An image that a plane has aligned is sheared, and takes a step more.
-    steps = 1 if work.alignment is None else 2
-    how = steps, work.upright
+    how = 1 if work.alignment is None else 2, work.upright
     u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
     removed = work.images.left.noise**2, work.images.right.noise**2
     alike, variance = refinement.surroundings(rest, work.a.deviation, keep, removed)

@@ -61,7 +61,8 @@ from rille.stages.hfvm.image import thinned
 from rille.stages.numeric.relaxation import OVERRELAXATION
 from rille.stages.numeric.windows import window_count, window_room, window_sum, window_sum32
 
-Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
+Maps = tuple[AnyArray, AnyArray]
+Frame = Callable[[AnyArray, AnyArray], Maps]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
 
 WINDOW_RADIUS_PX = 2
@@ -100,12 +101,7 @@ class SplineImages(NamedTuple):
 
 
 def refine(
-    images: SplineImages,
-    to_right: Frame,
-    start: tuple[AnyArray, AnyArray],
-    keep: AnyArray,
-    steps: int,
-    upright: bool = False,
+    images: SplineImages, to_right: Frame, start: Maps, keep: AnyArray, steps: int, upright: bool = False
 ) -> Refined:
     """Displacements without the perspective bias, in the frame in which they are given.
 
@@ -179,7 +175,7 @@ def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     return out_u, out_v
 
 
-def _axes(to_right: Frame, now: tuple[AnyArray, AnyArray]) -> AnyArray:
+def _axes(to_right: Frame, now: Maps) -> AnyArray:
     """Where a column and a row of the frame of steps lead in the right image, which may be turned and scaled against
     it: planes (4, row, col) float32, (4, 0, 0) where both frames are one."""
     there = to_right(*now)
@@ -281,9 +277,7 @@ def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
         out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
 
 
-def surroundings(
-    rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]
-) -> tuple[AnyArray, AnyArray]:
+def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]) -> Maps:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
     Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
@@ -348,7 +342,7 @@ RELIEF_STEPS = 4
 """Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""
 
 
-def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
     """Displacements of the relief that fits best.
 
     Parameters
@@ -413,7 +407,7 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     return lines, trust if epipolar.typical(bent) <= MAX_BENT_PX else 0.0
 
 
-def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
     """Kept displacements moved to their lines as far as those are trusted; the others as they are."""
     off = lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
     e = np.where(keep, np.float32(trust) * off, np.float32(0))
@@ -468,7 +462,7 @@ def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def
                 out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
 
 
-def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> Maps:
     """Displacements after ten Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
     u, v, across, down = (np.pad(a, 2) for a in (u, v, *stiff))
     _sweep(normal, across, down, u, v)
@@ -539,7 +533,7 @@ def standard_deviation(noise: AnyArray, disparity: AnyArray, keep: NDArray[np.bo
     return np.where(keep, np.sqrt(variance), np.float32(np.nan))
 
 
-def neighbours(disparity: AnyArray, keep: NDArray[np.bool_]) -> tuple[AnyArray, AnyArray]:
+def neighbours(disparity: AnyArray, keep: NDArray[np.bool_]) -> Maps:
     """Parts R and M of every pixel (row, col), see the module; meaningless where not matched."""
     radius = WINDOW_RADIUS_PX  # that of sub-pixel search and refinement
     side, bend = 2 * radius + 1, np.zeros(keep.shape, np.float32)
