@@ -13,7 +13,7 @@ nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they tell a turned moun
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -132,6 +132,17 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 
 
+def at_best(departs: Callable[[float], tuple[float, str]], *, clocked: bool) -> str:
+    """How a sensor departs from the camera at all clocks, by the one at which it does least; empty: at one it does not.
+
+    ``departs``: by which share it departs with a clock that is so late, s, and how, see :func:`departure`; infinite
+    where nothing can be compared.
+    """
+    clocks = sorted(np.linspace(-OFFSET_SIGMA_S, OFFSET_SIGMA_S, 21), key=abs) if clocked else [0.0]
+    compared = [one for one in map(departs, clocks) if one[0] < math.inf]
+    return min(compared, key=lambda one: (bool(one[1]), one[0]), default=(0.0, ""))[1]
+
+
 @dataclass(frozen=True)
 class RelativePrior:
     """Poses ``T_reference_left`` (frame, 3, 4) by dead reckoning or attitude, NaN of none.
@@ -154,8 +165,7 @@ class RelativePrior:
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own trajectory contradicts it at all clocks; empty: it does not."""
-        shifts = [0.0] if self.times is None else sorted(np.linspace(-OFFSET_SIGMA_S, OFFSET_SIGMA_S, 21), key=abs)
-        return min((self._departure(own, shift) for shift in shifts), key=lambda one: one[0])[1]
+        return at_best(lambda shift: self._departure(own, shift), clocked=self.times is not None)
 
     def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
@@ -264,17 +274,21 @@ class PositionPrior:
         return Fixes(near[of], self.positions[of], there[of], behind[of], velocity[of])
 
     def contradiction(self, own: OwnTrajectory) -> str:
-        """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
-        fixes = self.fixes(own)
+        """Why the camera's own way in the plane contradicts the shape of the positions at all clocks; empty: it does
+        not."""
+        return at_best(lambda late: self._departure(own, late), clocked=self.clocked)
+
+    def _departure(self, own: OwnTrajectory, late: float) -> tuple[float, str]:
+        """By which share of the camera's ways in the worst piece positions depart that are so late, s; why that is too
+        much."""
+        fixes, found = self.fixes(own, late), list[tuple[float, str]]()
         for k in enough(fixes, own.piece):
             mine = own.piece[fixes.nodes] == k
             way = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
             said = fit_plane(fixes.positions[mine], way).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
             share = float(np.hypot(*self.sigma[:2])) / math.sqrt(float((way**2).sum(1).mean()))
-            _, why = departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways")
-            if why:
-                return why
-        return ""
+            found.append(departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways"))
+        return max(found, key=lambda one: (bool(one[1]), one[0]), default=(math.inf, ""))
 
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
         """Factors of positions in the place; sources are three of the lever arm, and the clock."""

@@ -78,7 +78,11 @@ def test_a_sensor_joins_pieces_within_its_errors(sensor):
     assert 0.2 < nees(out, truth) < 3.0
 
 
-@pytest.mark.parametrize("sensor", [odometry, gnss])
+def exact(truth, rng, late):
+    return gnss(truth, rng, sigma=0.05, late=late)
+
+
+@pytest.mark.parametrize("sensor", [odometry, gnss, exact])
 def test_a_clock_that_is_late_is_found_and_stated(sensor):
     truth, rng = winding(), np.random.default_rng(2)
     segments, before = run_of(truth, rng)
