@@ -274,19 +274,14 @@ class Coarse:
         """The same, to be matched on by so many threads."""
         return replace(self, images=replace(self.images, threads=threads))
 
-    @staticmethod
-    def again(images: PyramidPair, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
-        """As it was when these were its state, ratio and alignment; ``images``: the images as they are."""
-        return Coarse(images, state, images.right, ratio, alignment)._seen()
-
-    def _seen(self) -> Coarse:
+    def seen(self) -> Coarse:
         """The same with the right image as it is matched."""
         right = self.right if self.alignment is None else plane.aligned(self.right, self.alignment, self.images.left)
         return replace(self, images=replace(self.images, right=right))
 
     def anew(self, **changed: Any) -> Coarse:
         """Coarse levels of the images with another ``ratio`` or ``alignment``."""
-        other = replace(self, **changed)._seen()
+        other = replace(self, **changed).seen()
         return replace(other, state=descend(other.images, COARSE_LEVEL, None, other.state.near_sign))
 
 

@@ -118,7 +118,8 @@ class Task:
         meta, (left, right) = bundle.meta, (bundle["left"], bundle["right"])
         oks, band = (left[2] != 0, right[2] != 0), Band(bundle["f"], meta["mu"])
         state = State(meta["level"], Map(*left[:2]), Map(*right[:2]), *oks, band, meta["near_sign"])
-        return Coarse.again(self.images, state, *(bundle.arrays.get(name) for name in ("ratio", "alignment")))
+        ratio, alignment = (bundle.arrays.get(name) for name in ("ratio", "alignment"))
+        return Coarse(self.images, state, self.images.right, ratio, alignment).seen()
 
     def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
