@@ -19,6 +19,7 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.scale import of_rig
 from rille.stages.numeric.least_squares import irls
 from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
@@ -84,13 +85,15 @@ def landmarks_of(
     camera, no relief of two surfaces under its template, and a distance whose standard deviation is below
     :data:`MAX_RELATIVE_SIGMA` of it. ``disparity_sigma``: pixels, of a disparity without relief.
     """
-    offset, matched = matches_at(points, disparity)
+    # A match is as exact as the coarser pixels let it be: of the left image where the right one has finer ones.
+    unit = max(1.0, float(of_rig(rig).max()))
+    offset, matched = matches_at(points, disparity, unit)
     right = points + offset
-    sigma = np.hypot(disparity_sigma, template_planes(points, disparity)[1])
+    sigma = np.hypot(unit * disparity_sigma, template_planes(points, disparity, unit)[1])
     landmarks = triangulated(points, right, rig, T_local_left, sigma)
     depth = T_local_left.inverse().apply(landmarks.position)[:, 2]
     off, _ = distances(rig, np.zeros(len(NAMES)), points, right)
-    meets = matched & (depth > 0) & (np.abs(off) <= MAX_DISPARITY_STEP_PX)
+    meets = matched & (depth > 0) & (np.abs(off) <= unit * MAX_DISPARITY_STEP_PX)
     smooth = meets & np.isfinite(sigma)
     spread = np.linalg.norm(landmarks.per_pixel, axis=1) * sigma
     near = smooth & (spread <= MAX_RELATIVE_SIGMA * np.where(smooth, depth, 0.0))
@@ -113,8 +116,11 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
 
 
-def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
-    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
+def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Bools]:
+    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree.
+
+    ``unit``: right pixels that :data:`MAX_DISPARITY_STEP_PX` counts in.
+    """
     validity = np.asarray(disparity["validity"])
     rows, cols = validity.shape
     inside = np.asarray(((points >= 0) & (points <= [cols - 1, rows - 1])).all(1))
@@ -131,12 +137,12 @@ def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
     corners = np.where(good[:, None, None], corners, 0.0).astype(np.float64)
     # Between two surfaces an interpolated disparity is that of neither. On one that is steep in disparity, as ground is
     # to low cameras far from each other, or to a right one of finer pixels, neighbours differ by what its plane says.
-    on_plane = np.stack([x4, y4], -1) @ template_planes(points, disparity)[0]
+    on_plane = np.stack([x4, y4], -1) @ template_planes(points, disparity, unit)[0]
     apart = np.minimum(np.ptp(corners, axis=1), np.ptp(corners - on_plane, axis=1))
-    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= MAX_DISPARITY_STEP_PX).all(1)
+    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= unit * MAX_DISPARITY_STEP_PX).all(1)
 
 
-def template_planes(points: Floats, disparity: Bundle) -> tuple[Floats, Floats]:
+def template_planes(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Floats]:
     """Planes of the disparities under each template: slopes (n, 2, 2) along columns and rows, pixels a pixel, 0 where
     nothing tells them; and the relief, the RMS (n,) of the disparities about them, pixels.
 
@@ -160,5 +166,5 @@ def template_planes(points: Floats, disparity: Bundle) -> tuple[Floats, Floats]:
     plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)
     rms = np.sqrt((rest**2).sum((1, 2)) / np.maximum(use.sum(1), 1))
-    told = (2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX)
+    told = (2 * use.sum(1) > dx.size) & (rms <= unit * MAX_DISPARITY_STEP_PX)
     return plane[:, 1:] / HALF, np.where(told, rms, np.nan)

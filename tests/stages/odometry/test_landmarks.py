@@ -99,6 +99,18 @@ def test_ground_that_is_steep_in_disparity_has_landmarks(rig):
     np.testing.assert_allclose(found.position[0], seen[150:152, 150].mean(axis=0), atol=1e-4)
 
 
+@pytest.mark.parametrize("scale", [1, 4])
+def test_what_is_one_surface_counts_in_the_coarser_pixels(scale):
+    size = CAMERA.width * scale, CAMERA.height * scale
+    right = Camera(400.0 * scale, 400.0 * scale, *((n - 1) / 2 for n in size), *size)
+    rig = Rig(CAMERA, right, RigidTransform(np.eye(3), np.array([-0.1, 0.0, 0.0])))
+    column, row, valid, _ = plane_disparity(0.1, rig)
+    column[:, 200:] += 3.0
+    found = from_disparity(np.array([[150.0, 150.5], [199.5, 150.5]]), (column, row, valid), rig)
+    assert np.isfinite(found.position).all(1).tolist() == [True, scale > 1]
+    assert found.sigma[0] == pytest.approx(0.1 * scale, rel=0.01)
+
+
 def test_rays_that_do_not_meet_give_no_landmark():
     column, row, valid, _ = plane_disparity()
     found = from_disparity(np.array([[150.0, 150.0]]), (column, row + np.float32(3.0), valid))
