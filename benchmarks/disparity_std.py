@@ -88,9 +88,9 @@ def judged(
     parts: list[Any] = []
     original = refinement.standard_deviation
 
-    def recording(noise: Any, column: Any, keep: Any) -> Any:
-        parts.extend(np.where(keep, p, np.nan) for p in (noise, *refinement.neighbours(column, keep)))
-        return original(noise, column, keep)
+    def recording(noise: Any, disparity: Any, keep: Any) -> Any:
+        parts.extend(np.where(keep, p, np.nan) for p in (noise, *refinement.neighbours(disparity, keep)))
+        return original(noise, disparity, keep)
 
     refinement.standard_deviation = recording
     try:

@@ -65,7 +65,7 @@ def rig_of(
     if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
         raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
-    to_the_right = float(T_right_left.inverse().translation[0])
+    to_the_right = float(rig.centre[0])
     # A rig whose baseline is rather vertical has no sides.
     if to_the_right < -0.5 * rig.baseline:
         raise InputError(

@@ -70,7 +70,7 @@ def drive(scene: Scene) -> Block | None:
 
 def depth_band(rig: Rig) -> tuple[str, int]:
     """Component of the disparity along the baseline, and the sign by which it is the smaller the nearer a point is."""
-    right, below, _ = rig.T_right_left.inverse().translation
+    right, below, _ = rig.centre
     # Right minus left: a camera to the right (or below) sees what is near farther to the left (or above).
     band, along = ("column_disparity", right) if abs(right) >= abs(below) else ("row_disparity", below)
     return band, 1 if along >= 0 else -1

@@ -149,7 +149,7 @@ def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -
 
 def judge_rig(rig: Rig) -> Finding:
     """Baseline and sides, as the calibration has them."""
-    left, right, b, x = rig.left, rig.right, rig.baseline, float(rig.T_right_left.translation[0])
+    left, right, b, x = rig.left, rig.right, rig.baseline, -float(rig.centre[0])
     # In pixels and in image widths: one lens before sensors of unlike pixels, or of unlike width, is no mistake.
     ratios = right.fx / left.fx, right.fx / left.fx * left.width / right.width
     unlike = min(max(ratio, 1 / ratio) for ratio in ratios)

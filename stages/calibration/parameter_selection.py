@@ -296,5 +296,5 @@ def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit)
 
 def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:
     """Pixels RMS (5,) that matches move across their lines for a radian of each parameter."""
-    squares = [np.mean(distances(rig, np.zeros(RIG), m.left, m.right)[1] ** 2, axis=0) for m in pairs]
+    squares = [np.mean(distances(rig, np.zeros(RIG), m.left, m.right)[1][:, :RIG] ** 2, axis=0) for m in pairs]
     return np.asarray(np.sqrt(np.mean(squares, axis=0)), dtype=np.float64)

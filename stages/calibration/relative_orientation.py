@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.epipolar import NAMES, distances, normals
+from rille.stages.geometry.epipolar import NAMES, distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
@@ -230,10 +230,11 @@ class _Part:
 
 def _linear(rig: Rig, matches: PointPairs, x: Floats) -> Linear:
     """Distances of a corrected rig with systematic errors about ``x``."""
-    distance, by_rig = distances(rig, x[:RIG], matches.left, matches.right)
+    distance, slopes = distances(rig, x[:RIG], matches.left, matches.right)
+    by_rig, by_point = slopes[:, :RIG], slopes[:, RIG:]
     # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
     made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
-    shifts = made_up - normals(rig, x[:RIG], matches.left)
+    shifts = made_up - by_point
     design = np.column_stack([by_rig, shifts, _smooth_terms(rig, matches)])
     column, row = np.minimum(matches.left.T * BLOCKS / [[rig.left.width], [rig.left.height]], BLOCKS - 1).astype(int)
     return Linear(distance - by_rig @ x[:RIG], design, x, row * BLOCKS + column)

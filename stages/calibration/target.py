@@ -131,15 +131,18 @@ def calibrate_rig(
     _enough(used.views)
     # From the first solution, now without the bad views' poses.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
-    _sides(used.rig(x).T_right_left)
+    rig = used.rig(x)
+    if rig.centre[0] < -SWAPPED * rig.baseline:
+        text = f"the right camera stands {-rig.centre[0]:.4g} m to the left of the left one"
+        raise InputError("RIL-310", text, remedy="swap the two sets of images")
     final = {r.name: r for r in used.residuals(x)}
     rms, sigma = used.errors(x)
     left, right = used.lenses(x)
     return RigCalibration(
         left,
         right,
-        used.rig(x).T_right_left,
-        {"baseline": used.rig(x).baseline, **dict(zip(used.names(), x.tolist(), strict=False))},
+        rig.T_right_left,
+        {"baseline": rig.baseline, **dict(zip(used.names(), x.tolist(), strict=False))},
         sigma,
         rms,
         tuple(final.get(r.name, ViewResidual(r.name, r.left, r.right, r.epipolar, used=False)) for r in first),
@@ -158,16 +161,6 @@ def _enough(views: Sequence[BoardView]) -> None:
 def _undetermined() -> DegenerateError:
     remedy = f"{MORE_VIEWS}, or a model with fewer coefficients"
     return DegenerateError("RIL-311", "the views do not determine the cameras", remedy=remedy)
-
-
-def _sides(T_right_left: RigidTransform) -> None:
-    x = float(T_right_left.translation[0])
-    if x > SWAPPED * float(np.linalg.norm(T_right_left.translation)):
-        raise InputError(
-            "RIL-310",
-            f"the right camera stands {x:.4g} m to the left of the left one",
-            remedy="swap the two sets of images",
-        )
 
 
 @dataclass(frozen=True)

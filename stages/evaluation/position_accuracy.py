@@ -191,7 +191,7 @@ def _candidates(moments: Floats, truth: TruePositions) -> Floats:
     return np.linspace(low, high, int(np.clip((high - low) / step, 2, MAX_TRIALS)) + 1)
 
 
-def fit_lever_arm(poses: Floats, truth: Floats, upright: bool) -> tuple[Floats, int]:
+def fit_lever_arm(poses: Floats, truth: Floats, upright: bool, moments: Floats | None = None) -> tuple[Floats, int]:
     """The lever arm ``l`` (3,), m, by which ``P_i + R_i l`` fits the true positions best, and how much of it shows.
 
     Along directions that the turns do not show, such as the axis of all turns, it is 0; others are counted.
@@ -200,15 +200,21 @@ def fit_lever_arm(poses: Floats, truth: Floats, upright: bool) -> tuple[Floats, 
     ----------
     poses : (frame, 3, 4) T_world_left, m.
     truth : (frame, 2 or 3) m, of a frame of its own.
+    moments : (frame,) s, where the truth has a clock of its own, which the arm ahead looks like; None: it has none.
     """
     both, width, arm, shown = _both(poses[:, :, 3], truth), truth.shape[1], np.zeros(3), np.zeros(3, bool)
     P, R = poses[both, :, 3], poses[both, :, :3]
+    way = np.zeros_like(P)
+    if moments is not None:
+        # Two images of one moment have no speed.
+        way = np.gradient(P, axis=0) / np.maximum(np.gradient(moments[both]), 1e-9)[:, None]
     for _ in range(20):
         moved = fit_rigid(P + R @ arm, truth[both], upright).moved
-        # A shift of the truth takes the mean, its turns about one or three axes what looks like them.
+        # A shift of the truth takes the mean, its turns about one or three axes and its clock what looks like them.
         centred = np.pad(moved - moved.mean(axis=0), ((0, 0), (0, 3 - width)))
         axes = np.eye(3)[2 if upright or width == 2 else 0 :]
-        turns = np.stack([np.cross(axis, centred)[:, :width] for axis in axes], axis=2).reshape(-1, len(axes))
+        turns = np.stack([*(np.cross(axis, centred) for axis in axes), way - way.mean(axis=0)], axis=2)
+        turns = turns[:, :width].reshape(-1, len(axes) + 1)
         swings = (R - R.mean(axis=0))[:, :width].reshape(-1, 3)
         off = centred[:, :width] - (P - P.mean(axis=0))[:, :width]
         u, s, vt = np.linalg.svd(swings - turns @ np.linalg.pinv(turns) @ swings, full_matrices=False)
@@ -240,7 +246,7 @@ def position_accuracy(
     without = _compared(poses, truth, moments, upright)
     if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < MIN_LEVER_FRAMES:
         return without
-    lever, rank = fit_lever_arm(poses, without.truth, upright)
+    lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)
     before, after = (compared.metrics["position_rmse"]["value"] for compared in (without, fitted))
     if not rank or np.linalg.norm(lever) > MAX_LEVER_ARM_M or after is None or after > MAX_ERROR_SHARE * before:

@@ -35,8 +35,7 @@ DIFFERENCE_STEP_RAD = 1e-6
 
 def standing(rig: Rig) -> bool:
     """Whether one camera stands above the other: epipolar lines run down the image then, and not along its rows."""
-    centre = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
-    return bool(abs(centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
+    return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
 
 
 def corrected(rig: Rig, correction: Floats) -> Rig:
@@ -53,7 +52,10 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
 
 
 def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Signed distances (n,) from the epipolar lines, pixels, and their derivatives (n, 5) in pixels per radian.
+    """Signed distances (n,) from the epipolar lines, pixels, and their derivatives (n, 7).
+
+    The derivatives are those by the correction, pixels per radian, and by column and row of the right point, which are
+    the unit normals of the lines.
 
     Parameters
     ----------
@@ -69,14 +71,14 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
     to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]
-    distance, slopes = np.empty(len(left)), np.empty((len(left), 5))
+    distance, slopes = np.empty(len(left)), np.empty((len(left), 7))
     _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
     return distance, slopes
 
 
 @njit(cache=True, nogil=True)
 def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
-    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 5)."""
+    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 7)."""
     for n in range(len(left)):
         x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
         line = product(to_line, x, y)
@@ -85,20 +87,11 @@ def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: igno
         if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
             length = -length
         d = (u * line[0] + v * line[1] + line[2]) / length
-        distance[n] = d
+        distance[n], slopes[n, 5], slopes[n, 6] = d, line[0] / length, line[1] / length
         for p in range(5):
             a, b, c = product(to_slopes[p], x, y)
             # Quotient rule: the line's normal changes its length as well.
             slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
-
-
-def normals(rig: Rig, correction: Floats, left: Floats) -> Floats:
-    """Unit normals (n, 2) of the epipolar lines of left points: what a distance grows by for a pixel of column, row."""
-    centre, _ = _centre(rig, correction)
-    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
-    to_line = np.linalg.inv(rig.right.matrix).T @ rotation @ cross_matrix(centre)
-    line = np.einsum("nk,ik->ni", rig.left.rays(left), to_line)
-    return np.asarray(line[:, :2] / _signed_length(line)[:, None], dtype=np.float64)
 
 
 def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, Floats]:
@@ -179,8 +172,7 @@ def exchanged(as_given: float, other_way: float) -> bool:
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
-    given = -rig.T_right_left.rotation.T @ rig.T_right_left.translation
-    unit = given / np.linalg.norm(given)
+    unit = rig.centre / np.linalg.norm(rig.centre)
     axis = np.array([1.0, 0.0, 0.0]) if standing(rig) else np.array([0.0, 1.0, 0.0])
     across = axis - unit * float(unit @ axis)
     across /= np.linalg.norm(across)
@@ -192,9 +184,3 @@ def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     direction = swing / length
     tangent = (np.eye(3) - np.outer(direction, direction)) / length
     return rig.baseline * direction, rig.baseline * tangent @ np.column_stack([across, forward])
-
-
-def _signed_length(line: Floats) -> Floats:
-    """Length of the normals of lines (n, 3), signed so that they point down the image (right, of steep lines)."""
-    steep = np.abs(line[:, 0]) > np.abs(line[:, 1])
-    return np.hypot(line[:, 0], line[:, 1]) * np.where(np.where(steep, line[:, 0], line[:, 1]) < 0, -1.0, 1.0)

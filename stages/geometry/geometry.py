@@ -154,6 +154,11 @@ class Rig:
         """Distance of the two projection centres, metres."""
         return float(np.linalg.norm(self.T_right_left.translation))
 
+    @property
+    def centre(self) -> Floats:
+        """Projection centre (3,) of the right camera in the left camera's frame, metres."""
+        return np.asarray(-self.T_right_left.rotation.T @ self.T_right_left.translation)
+
     def check(self, shape: tuple[int, ...] | None = None) -> None:
         """Refuse a rig without a baseline, and a disparity (rows, cols) of another size than the left image's."""
         if not self.baseline > 0:

@@ -27,11 +27,9 @@ def posed(poses: Floats) -> Bools:
 def by_frame(values: Floats, frames: Sequence[int], wanted: Sequence[int]) -> Floats:
     """Rows (frame, ...) of the wanted frames, of poses or covariances of ``frames``; NaN where there is none."""
     row = {frame: k for k, frame in enumerate(frames)}
-    out = np.full((len(wanted), *values.shape[1:]), np.nan)
-    for k, frame in enumerate(wanted):
-        if frame in row:
-            out[k] = values[row[frame]]
-    return out
+    missing = np.full(values.shape[1:], np.nan)
+    rows = [values[row[frame]] if frame in row else missing for frame in wanted]
+    return np.array(rows, dtype=np.float64).reshape(-1, *values.shape[1:])
 
 
 def compose(a: Floats, b: Floats) -> Floats:

@@ -5,6 +5,8 @@ Two cameras may have pixels or lenses of unlike size; so may the images that are
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rille.stages.core.arrays import Floats
@@ -27,6 +29,14 @@ def effective(scale: float) -> float:
 def of_rig(rig: Rig) -> Floats:
     """Scale (2,) along columns and rows by the focal lengths; 1 where they are alike."""
     return np.array([effective(rig.right.fx / rig.left.fx), effective(rig.right.fy / rig.left.fy)])
+
+
+def axes(rig: Rig) -> Floats:
+    """Where a column and a row of the left image lead in the right one, pixels: its columns (2,) and rows (2,), by the
+    scale, and by how the cameras are rolled against each other."""
+    (cosine, _, _), (sine, _, _), _ = rig.T_right_left.rotation
+    roll = math.atan2(sine, cosine)
+    return of_rig(rig)[:, None] * [[math.cos(roll), -math.sin(roll)], [math.sin(roll), math.cos(roll)]]
 
 
 def coarser_focal(rig: Rig) -> float:

@@ -17,7 +17,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.scale import other_size
-from rille.stages.hfvm import plane
-from rille.stages.hfvm.epipolar import typical
+from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
-from rille.stages.hfvm.level import PyramidPair, State, descend, sample
+from rille.stages.hfvm.level import PyramidPair, State, descend, sample, textured
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -74,14 +74,6 @@ def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
     # NaN is not less, and so unknown as well.
     known = (np.abs(u) < MAX_DISPLACEMENT_PX) & (np.abs(v) < MAX_DISPLACEMENT_PX)
     return PriorDisparities(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
-
-
-def aligned(prior: PriorDisparities | None, h: plane.Matrix | None) -> PriorDisparities | None:
-    """The prior towards the aligned right image."""
-    if prior is None or h is None:
-        return prior
-    # Ends that come to lie near the horizon of the plane are led farther than the given ones.
-    return _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
 
 
 def impose(images: PyramidPair, state: State, prior: PriorDisparities | None) -> State:
@@ -218,7 +210,7 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 
     def weigh(off: AnyArray) -> AnyArray:
         # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * typical(off)))
+        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * epipolar.typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
     hold = 1e-3 * target.size * np.eye(len(basis))
@@ -251,52 +243,64 @@ class Coarse:
     """A pair of images and its matches at a coarse level, ``state``.
 
     ``images``: the images as they are matched: the right one in the left one's brightness, divided by ``ratio``, and
-    aligned by the homography ``alignment`` (None: neither). ``right``: as it is before it is aligned. ``prior``:
-    disparities known beforehand.
+    aligned by the homography ``alignment`` (None: neither). ``given``: the right one as it came. ``prior``: disparities
+    known beforehand.
     """
 
     images: PyramidPair
     state: State
-    right: Image
+    given: Image
     ratio: Floats | None = None
     alignment: plane.Matrix | None = None
     prior: PriorDisparities | None = None
+
+    @cached_property
+    def right(self) -> Image:
+        """The right image in the left one's brightness, before it is aligned."""
+        return levelled(self.given, self.ratio)
+
+    @property
+    def share(self) -> float:
+        """Share of the left image's pixels with texture that are consistent."""
+        told = textured(self.images.left.layers[self.state.level], self.images.params)
+        return float(np.mean(self.state.left_ok[told])) if told.any() else 0.0
+
+    @property
+    def upright(self) -> bool:
+        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
+        return not epipolar.along_rows(self.state.band.f, self.images.left.shapes[0])
 
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""
         return replace(self, images=replace(self.images, threads=threads))
 
-    @staticmethod
-    def again(images: PyramidPair, state: State, ratio: Floats | None, alignment: plane.Matrix | None) -> Coarse:
-        """As it was when these were its state, ratio and alignment; ``images``: the images as they are."""
-        right = levelled(images.right, ratio)
-        matched = right if alignment is None else plane.aligned(right, alignment, images.left)
-        return Coarse(replace(images, right=matched), state, right, ratio, alignment)
+    def seen(self) -> Coarse:
+        """The same with the right image as it is matched."""
+        right = self.right if self.alignment is None else plane.aligned(self.right, self.alignment, self.images.left)
+        return replace(self, images=replace(self.images, right=right))
 
-    def anew(self, matched: Image, **changed: object) -> Coarse:
-        """Coarse levels of another right image, and other facts changed."""
-        images = replace(self.images, right=matched)
-        return replace(self, images=images, state=descend(images, COARSE_LEVEL, None, self.state.near_sign), **changed)  # type: ignore[arg-type]
+    def anew(self, **changed: Any) -> Coarse:
+        """Coarse levels of the images with another ``ratio`` or ``alignment``."""
+        other = replace(self, **changed).seen()
+        return replace(other, state=descend(other.images, COARSE_LEVEL, None, other.state.near_sign))
 
 
 def even(coarse: Coarse) -> Coarse:
     """Brightness ratio of both images undone in the right one, first by a guess where little matches."""
-    left, right = coarse.images.left, coarse.right
-    if coarse.state.share < MIN_EVEN_SHARE:
-        guessed = guess(left, right, min(COARSE_LEVEL + 2, coarse.images.levels - 1))
+    left = coarse.images.left
+    if coarse.share < MIN_EVEN_SHARE:
+        guessed = guess(left, coarse.given, min(COARSE_LEVEL + 2, coarse.images.levels - 1))
         if greatest(guessed) > MIN_LOG_RATIO:
-            other = levelled(right, guessed)
-            tried = coarse.anew(other, right=other, ratio=guessed)
-            coarse = tried if tried.state.share > coarse.state.share else coarse
+            tried = coarse.anew(ratio=guessed)
+            coarse = tried if tried.share > coarse.share else coarse
     for _ in range(2):  # matches correct the ratio, and those of the corrected image once more
-        ratio = ratio_of_matches(left, right, coarse.state)
+        ratio = ratio_of_matches(left, coarse.given, coarse.state)
         before = 0.0 if coarse.ratio is None else coarse.ratio
         if ratio is None or greatest(ratio - before) <= MIN_LOG_RATIO:
             break
-        other = levelled(right, ratio)
-        tried = coarse.anew(other, right=other, ratio=ratio)
+        tried = coarse.anew(ratio=ratio)
         # Of the consistent pixels a few change anyway.
-        if tried.state.share < 0.95 * coarse.state.share:
+        if tried.share < 0.95 * coarse.share:
             break
         coarse = tried
     return coarse
@@ -304,31 +308,36 @@ def even(coarse: Coarse) -> Coarse:
 
 def known(coarse: Coarse) -> Coarse:
     """Disparities known beforehand in the place of those found."""
-    prior = aligned(coarse.prior, coarse.alignment)
+    prior, h = coarse.prior, coarse.alignment
+    if prior is not None and h is not None:
+        # Ends that come to lie near the horizon of the plane are led farther than the given ones.
+        prior = _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
     return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
 
 def align(coarse: Coarse) -> Coarse:
     """The right image aligned by the dominant plane, where one explains the matches."""
-    few = coarse.state.share < MIN_MANY_SHARE
+    few = coarse.share < MIN_MANY_SHARE
     h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
-    return coarse if h is None else known(coarse.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h))
+    return coarse if h is None else known(coarse.anew(alignment=h))
 
 
 def turn(coarse: Coarse) -> Coarse:
     """The right image turned and scaled by keypoints, where hardly a pixel matches and that helps."""
     # A plane may also be fitted to the few matches that chance makes.
-    sizes = coarse.images.left.shapes[0], coarse.right.shapes[0]
-    few = coarse.state.share <= MIN_UPRIGHT_SHARE or (coarse.alignment is None and other_size(*sizes))
-    h = plane.find_turn(coarse.images.left, coarse.right) if few and coarse.prior is None else None
+    left, given = coarse.images.left, coarse.given
+    unlike = coarse.alignment is None and other_size(left.shapes[0], given.shapes[0])
+    few = unlike or coarse.share <= MIN_UPRIGHT_SHARE
+    h = plane.find_turn(left, given) if few and coarse.prior is None else None
     if h is None:
         return coarse
-    upright = replace(coarse, state=replace(coarse.state, near_sign=0.0))
-    turned = upright.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h)
+    # Of images turned against each other the brightness tells nothing before they are upright.
+    upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
+    turned = upright.anew(alignment=h)
     # Keypoints stand on what sticks out; the matches that they made possible say more of the plane.
-    h = plane.refitted(sample(turned.images, turned.state), COARSE_LEVEL, coarse.images.left.shapes, h)
-    again = turned if h is None else upright.anew(plane.aligned(coarse.right, h, coarse.images.left), alignment=h)
-    return max(coarse, turned, again, key=lambda tried: tried.state.share)
+    h = plane.refitted(sample(turned.images, turned.state), COARSE_LEVEL, left.shapes, h)
+    again = turned if h is None else upright.anew(alignment=h)
+    return max(coarse, turned, again, key=lambda tried: tried.share)
 
 
 def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:

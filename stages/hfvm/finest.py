@@ -136,7 +136,7 @@ class FinestWork:
 
     ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
     from the one to the other, is given. ``left, back``: whole displacements of the left window in that of ``b``, and
-    the reverse. ``images``: whose windows they are.
+    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.coarse.Coarse`.
     """
 
     a: Layer
@@ -146,6 +146,7 @@ class FinestWork:
     back: Map
     images: PyramidPair
     alignment: plane.Matrix | None = None
+    upright: bool = False
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Displacements in the window of the right image, of those in the window of ``b``."""
@@ -172,7 +173,7 @@ class FinestWork:
 class Fine:
     """What is known of each pixel, (row, col): displacements to ``b``, float32 pixels; bits that speak against it
     (:class:`~rille.stages.core.validity.Validity`); back-matching error, pixels; feature distance, -1 outside; and the
-    variance of the column displacement that noise makes, squared pixels."""
+    variance of the column displacement, on upright lines the row's, that noise makes, squared pixels."""
 
     u: AnyArray
     v: AnyArray
@@ -235,8 +236,8 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
     keep = fine.keep
     # An image that a plane has aligned is sheared, and takes a step more.
-    steps = 1 if work.alignment is None else 2
-    u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, steps)
+    how = 1 if work.alignment is None else 2, work.upright
+    u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
     removed = work.images.left.noise**2, work.images.right.noise**2
     alike, variance = refinement.surroundings(rest, work.a.deviation, keep, removed)
     # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
@@ -259,7 +260,7 @@ def landing(work: FinestWork, fine: Fine) -> Fine:
 
 def speckles(work: FinestWork, fine: Fine) -> Fine:
     """Reasons against pixels in small isolated patches, most of which are errors."""
-    small = isolated(work.left.u, fine.keep, work.images.params.speckle)
+    small = isolated(work.left.v if work.upright else work.left.u, fine.keep, work.images.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
 
 
@@ -276,14 +277,15 @@ def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matr
 @dataclass(frozen=True)
 class Ending:
     """What the whole left image, of ``shape``, tells a window for its last steps: the sign of depth (see
-    ``level.State``), the homography that the right image was aligned by, epipolar lines of the matches, and planes
-    without texture."""
+    ``level.State``), the homography that the right image was aligned by, epipolar lines of the matches, planes
+    without texture, and whether lines are ``upright``."""
 
     shape: Shape
     near_sign: float = NEAR_SIGN
     alignment: plane.Matrix | None = None
     f: epipolar.Matrix | None = None
     planes: textureless.Planes | None = None
+    upright: bool = False
 
 
 def complete(
@@ -315,7 +317,7 @@ def complete(
     filled = (alone | beside).astype(np.uint8)
     fill_rows(u, v, matches | beside, params.fill_reach, ending.near_sign or -1.0, filled)
     matches &= ~alone
-    std = refinement.standard_deviation(results["noise"], u, keep & ~alone)
+    std = refinement.standard_deviation(results["noise"], v if ending.upright else u, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
     filled[(valid == 0) | matches] = 0
@@ -365,7 +367,7 @@ def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     if state.level > 0:
         state = match_level(replace(images, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
     left, right = a.layers[0], b.layers[0]
-    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment)
+    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment, pair.upright)
     if pair.alignment is not None:
         work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
     result = subpixel(work)  # 4.3.2
@@ -417,7 +419,7 @@ def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Endin
     f, planes = None if free else fitted_lines(matches, shapes), None
     if f is not None and "planes" not in images.params.without:
         planes = textureless.find((images.left, images.right), matches, f, sign)
-    return Ending(shapes[0], sign, pair.alignment, f, planes)
+    return Ending(shapes[0], sign, pair.alignment, f, planes, pair.upright)
 
 
 def around(pair: Coarse, window: Window) -> Window:

@@ -105,11 +105,6 @@ class State:
         swapped = self.right, self.left, self.right_ok, self.left_ok
         return State(self.level, *swapped, self.band.reverse(), -self.near_sign)
 
-    @property
-    def share(self) -> float:
-        """Share of the left image's pixels that are consistent."""
-        return float(np.mean(self.left_ok))
-
 
 @dataclass(frozen=True)
 class Look:
@@ -285,12 +280,17 @@ def hand_down(state: State, params: HfvmParams) -> Map:
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 
 
+def textured(layer: Layer, params: HfvmParams) -> NDArray[np.bool_]:
+    """Pixels that tell something: what is black in both images, as space is, agrees everywhere."""
+    return np.asarray((layer.valid != 0) & (layer.deviation >= params.texture))
+
+
 def sample(images: PyramidPair, state: State) -> Sample:
     """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
-    y, x = thinned(state.left_ok, MAX_FIT_MATCHES)
+    a, b = images.left.layers[state.level], images.right.layers[state.level]
+    y, x = thinned(state.left_ok & textured(a, images.params), MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
     wanted[y, x] = 1
-    a, b = images.left.layers[state.level], images.right.layers[state.level]
     u, v, _ = solver.sums(LevelPair(a.words, b.words), state.left.u, state.left.v, wanted)
     return Sample(x, y, u[y, x], v[y, x])
 

@@ -24,15 +24,16 @@ along. Stiffness starts weak and tolerant of bends: from the first, it would tak
 edges for relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.epipolar`); k gives way
 where they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 
-**Standard deviations** of the column disparities come from what the matcher knows at each pixel.
+**Standard deviations** of the column disparities, of the rows' where epipolar lines run along the columns, come from
+what the matcher knows at each pixel.
 
 The error of a disparity is taken as the sum of independent parts, so that variances add:
 
     std^2 = floor^2 + noise^2 N + relief^2 R + border^2 M
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
-refinement, times the column element of the inverse structure tensor). A window along a column edge has a small one,
-a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
+refinement, times the element of the inverse structure tensor for the column, or the row). A window along a column edge
+has a small one, a window along a row edge a large one. R: mean square, in the 5 x 5 window, of how far a disparity
 lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
 depth edge mixes the surfaces in it. M: share of unmatched pixels in 9 x 9; beside occlusions and failed matches a match
 is often drawn to the wrong surface. The floor stands for errors that no pixel shows: sampling, lenses, the matcher's
@@ -60,7 +61,8 @@ from rille.stages.hfvm.image import thinned
 from rille.stages.numeric.relaxation import OVERRELAXATION
 from rille.stages.numeric.windows import window_count, window_room, window_sum, window_sum32
 
-Frame = Callable[[AnyArray, AnyArray], tuple[AnyArray, AnyArray]]
+Maps = tuple[AnyArray, AnyArray]
+Frame = Callable[[AnyArray, AnyArray], Maps]
 """Displacements to the right image of those in the frame in which steps are taken, both (row, col) float32 pixels."""
 
 WINDOW_RADIUS_PX = 2
@@ -82,7 +84,7 @@ of which denoising leaves about .3."""
 
 class Refined(NamedTuple):
     """Displacements (row, col) float32, the mean-free residual variance of their windows, squared grey levels (inf:
-    none), and the variance of the column displacement for a unit of variance of the grey levels."""
+    none), and the variance of the column displacement, or the row's, for a unit of variance of the grey levels."""
 
     u: AnyArray
     v: AnyArray
@@ -99,7 +101,7 @@ class SplineImages(NamedTuple):
 
 
 def refine(
-    images: SplineImages, to_right: Frame, start: tuple[AnyArray, AnyArray], keep: AnyArray, steps: int
+    images: SplineImages, to_right: Frame, start: Maps, keep: AnyArray, steps: int, upright: bool = False
 ) -> Refined:
     """Displacements without the perspective bias, in the frame in which they are given.
 
@@ -108,11 +110,12 @@ def refine(
     to_right : from the frame in which steps are taken to the right image.
     start : (row, col) float32, smoothed displacements, pixels.
     keep : (row, col) bool, pixels that have one.
+    upright : whether the variance is that of the row displacement.
     """
     now, rests, axes = start, list[AnyArray](), _axes(to_right, start)
     for _ in range(steps):
         planes = np.empty((4, *keep.shape), np.float32)
-        _window_steps(images, to_right(*now), axes, keep, planes)
+        _window_steps(images, to_right(*now), axes, keep, planes, upright)
         step_u, step_v, rest, per_noise = planes
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
@@ -172,7 +175,7 @@ def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     return out_u, out_v
 
 
-def _axes(to_right: Frame, now: tuple[AnyArray, AnyArray]) -> AnyArray:
+def _axes(to_right: Frame, now: Maps) -> AnyArray:
     """Where a column and a row of the frame of steps lead in the right image, which may be turned and scaled against
     it: planes (4, row, col) float32, (4, 0, 0) where both frames are one."""
     there = to_right(*now)
@@ -183,11 +186,11 @@ def _axes(to_right: Frame, now: tuple[AnyArray, AnyArray]) -> AnyArray:
 
 
 @njit(cache=True, nogil=True)
-def _window_steps(images, now, axes, keep, out):  # type: ignore[no-untyped-def]
+def _window_steps(images, now, axes, keep, out, upright):  # type: ignore[no-untyped-def]
     """Steps of all windows; each is summed afresh, so that nothing adds up. Reach: the window's radius.
 
     ``out``: planes (4, row, col): columns and rows, zero where there is no step; residual variance before the step,
-    infinite where there is none; and the variance of the column for a unit of variance of the grey levels.
+    infinite where there is none; and the variance of the column, or the row, for a unit of variance of the grey levels.
     """
     (rows, cols), radius, size = keep.shape, WINDOW_RADIUS_PX, 2 * WINDOW_RADIUS_PX + 1
     fresh, total = np.zeros((10, cols + 2 * radius), np.float32), np.empty((10, cols), np.float32)
@@ -205,7 +208,7 @@ def _window_steps(images, now, axes, keep, out):  # type: ignore[no-untyped-def]
                 a, b, c, d, e, line = ring[0, k], ring[1, k], ring[2, k], ring[3, k], ring[4, k], total[k]
                 for x in range(cols):
                     line[x] = (a[x] + (b[x] + c[x])) + (d[x] + e[x])
-            _solve_windows(total, keep[y], out[:, y])
+            _solve_windows(total, keep[y], out[:, y], upright)
 
 
 @njit(cache=True, nogil=True)
@@ -228,7 +231,7 @@ def _products(images, now, axes, keep, y, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
+def _solve_windows(sums, keep, out, upright):  # type: ignore[no-untyped-def]
     """Steps of a row from the sums (10, col) over each pixel's window."""
     noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
@@ -247,7 +250,7 @@ def _solve_windows(sums, keep, out):  # type: ignore[no-untyped-def]
         out[1, x] = min(max((a * q - b * p) / det, -one), one) if use else nil
         # Rounding may leave the residual of a perfect fit below zero.
         out[2, x] = max(sums[9, x] - sum_r * sum_r / n, nil) / n if use else far
-        out[3, x] = c / det if use else nil
+        out[3, x] = (a if upright else c) / det if use else nil
 
 
 def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
@@ -274,9 +277,7 @@ def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
         out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
 
 
-def surroundings(
-    rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]
-) -> tuple[AnyArray, AnyArray]:
+def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]) -> Maps:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
     Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
@@ -341,7 +342,7 @@ RELIEF_STEPS = 4
 """Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""
 
 
-def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
     """Displacements of the relief that fits best.
 
     Parameters
@@ -406,7 +407,7 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     return lines, trust if epipolar.typical(bent) <= MAX_BENT_PX else 0.0
 
 
-def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
     """Kept displacements moved to their lines as far as those are trusted; the others as they are."""
     off = lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
     e = np.where(keep, np.float32(trust) * off, np.float32(0))
@@ -461,7 +462,7 @@ def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def
                 out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
 
 
-def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> Maps:
     """Displacements after ten Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
     u, v, across, down = (np.pad(a, 2) for a in (u, v, *stiff))
     _sweep(normal, across, down, u, v)
@@ -513,32 +514,32 @@ RELIEF_FACTOR = 1.71
 BORDER_PX = 0.80
 
 
-def standard_deviation(noise: AnyArray, column: AnyArray, keep: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Standard deviation of matched column disparities.
+def standard_deviation(noise: AnyArray, disparity: AnyArray, keep: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Standard deviation of matched disparities of one axis.
 
     Parameters
     ----------
     noise : (row, col) float32, part N of every pixel, squared pixels.
-    column : (row, col) float32 column disparities, pixels.
+    disparity : (row, col) float32 pixels.
     keep : (row, col) bool, matched pixels.
 
     Returns
     -------
     (row, col) float32 pixels, NaN where not matched.
     """
-    relief, border = neighbours(column, keep)
+    relief, border = neighbours(disparity, keep)
     variance = np.float32(FLOOR_PX**2) + np.float32(NOISE_FACTOR**2) * noise
     variance += np.float32(RELIEF_FACTOR**2) * relief + np.float32(BORDER_PX**2) * border
     return np.where(keep, np.sqrt(variance), np.float32(np.nan))
 
 
-def neighbours(column: AnyArray, keep: NDArray[np.bool_]) -> tuple[AnyArray, AnyArray]:
+def neighbours(disparity: AnyArray, keep: NDArray[np.bool_]) -> Maps:
     """Parts R and M of every pixel (row, col), see the module; meaningless where not matched."""
     radius = WINDOW_RADIUS_PX  # that of sub-pixel search and refinement
     side, bend = 2 * radius + 1, np.zeros(keep.shape, np.float32)
     near, far, here = slice(None, -2 * radius), slice(2 * radius, None), slice(radius, -radius)
-    sides = column[near, here] + column[far, here] + column[here, near] + column[here, far]
-    bend[here, here] = column[here, here] - np.float32(0.25) * sides
+    sides = disparity[near, here] + disparity[far, here] + disparity[here, near] + disparity[here, far]
+    bend[here, here] = disparity[here, here] - np.float32(0.25) * sides
     # All five are matched, and in the image.
     five = np.zeros((side, side), np.uint8)
     five[radius, ::radius] = five[::radius, radius] = 1

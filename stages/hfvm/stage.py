@@ -47,7 +47,8 @@ class StereoMatches:
     ``backmatch_error``: float32 pixels, NaN where the match leaves the right image, and on the planes of textureless
     regions (:mod:`~rille.stages.hfvm.textureless`). ``distance``: float32 mean feature distance at the
     whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where the match
-    leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity (see
+    leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity, or of the
+    row's, where cameras stand one above the other (see
     :mod:`~rille.stages.hfvm.refinement`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
     pre-aligned by a plane.
     """
@@ -127,7 +128,7 @@ OUTPUTS = (
     Array("validity", _GRID, "uint8", "1", "bit mask, see stages.core.validity", "", "left image"),
     Array("backmatch_error", _GRID, "float32", "px", "error of matching there and back", "nan", "left image"),
     Array("distance", _GRID, "float32", "1", "least feature distance", "nan", "left image"),
-    Array("disparity_std", _GRID, "float32", "px", "standard deviation of the column disparity", "nan", "left image"),
+    Array("disparity_std", _GRID, "float32", "px", "standard deviation along the epipolar line", "nan", "left image"),
 )
 
 

@@ -118,7 +118,8 @@ class Task:
         meta, (left, right) = bundle.meta, (bundle["left"], bundle["right"])
         oks, band = (left[2] != 0, right[2] != 0), Band(bundle["f"], meta["mu"])
         state = State(meta["level"], Map(*left[:2]), Map(*right[:2]), *oks, band, meta["near_sign"])
-        return Coarse.again(self.images, state, *(bundle.arrays.get(name) for name in ("ratio", "alignment")))
+        ratio, alignment = (bundle.arrays.get(name) for name in ("ratio", "alignment"))
+        return Coarse(self.images, state, self.images.right, ratio, alignment).seen()
 
     def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
@@ -151,7 +152,7 @@ def _final(task: Task) -> Bundle[TileFacts]:
     f, terms, planes = bundle.arrays.get("f"), bundle.meta["terms"], None
     if f is not None and terms:
         planes = textureless.Planes(bundle["region"], terms, f)
-    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes)
+    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes, task.pair.upright)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
     arrays = finest.interpolate_undefined(task.pair, window, task.fine(finest.around(task.pair, window)), ending)

@@ -103,7 +103,8 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
     products = a @ b.T
     rows, nearest = np.arange(len(a)), products.argmax(axis=1)
     best = products[rows, nearest]
-    rows = np.flatnonzero(best == products.max(axis=0)[nearest])
+    # One a column: the other of two that are equally near stays, and is the second best below.
+    rows = np.flatnonzero(products.argmax(axis=0)[nearest] == rows)
     nearest, best = nearest[rows], best[rows]
     # What is left of them is the second best of each row and column.
     products[rows, nearest] = 0.0

@@ -78,13 +78,9 @@ def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPla
     tolerance = np.sqrt((2.0 * sigma) ** 2 + (MAX_RELIEF_SHARE * rho) ** 2)
     theta = _consensus(samples, tolerance, allowed)
     if theta is not None:
-        information = tolerance**-2.0
-
-        def biweight(residual: Floats) -> Floats:
-            """Tukey's weight of the residual over twice the tolerance, on that of the observation."""
-            return np.asarray(information * np.maximum(0.0, 1.0 - 0.25 * residual**2 * information) ** 2)
-
-        theta = irls(rays, rho, biweight, start=theta)
+        # Tukey's weight of the residual over twice the tolerance, on that of the observation.
+        weight = tolerance**-2.0
+        theta = irls(rays, rho, lambda r: weight * np.maximum(0.0, 1.0 - 0.25 * r**2 * weight) ** 2, start=theta)
         expected = rays @ theta
         on = (expected > MIN_HORIZON_SIGMAS * sigma) & (np.abs(rho - expected) < tolerance)
         # theta = -n / h: its length is one over the height.

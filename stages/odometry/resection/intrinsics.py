@@ -23,14 +23,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
-from rille.stages.geometry import epipolar
+from rille.stages.geometry import epipolar, rigid
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 from rille.stages.numeric.robust import huber_weight
@@ -175,8 +174,7 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
 
 def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
     """Largest turn of a frame of the segment from its key, degrees."""
-    turns = scipy.spatial.transform.Rotation.from_matrix(state.R @ T_local_key.rotation).magnitude()
-    return math.degrees(turns.max())
+    return math.degrees(rigid.angle(state.R @ T_local_key.rotation).max())
 
 
 def contribution(

@@ -19,12 +19,14 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.scale import of_rig
 from rille.stages.numeric.least_squares import irls
 from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
 
 MAX_DISPARITY_STEP_PX = 1.0
-"""Pixels: neighbours whose disparities differ by more lie on two surfaces; also the bound of back-matching (4.3.3)."""
+"""Pixels: neighbours whose disparities differ by more than those of one plane lie on two surfaces; also the bound of
+back-matching (4.3.3)."""
 MAX_RELATIVE_SIGMA = 0.2
 """Largest standard deviation of a landmark's distance over the distance; beyond, depth is no longer normal though
 disparity is, and first-order covariances are wrong."""
@@ -83,13 +85,15 @@ def landmarks_of(
     camera, no relief of two surfaces under its template, and a distance whose standard deviation is below
     :data:`MAX_RELATIVE_SIGMA` of it. ``disparity_sigma``: pixels, of a disparity without relief.
     """
-    offset, matched = matches_at(points, disparity)
+    # A match is as exact as the coarser pixels let it be: of the left image where the right one has finer ones.
+    unit = max(1.0, float(of_rig(rig).max()))
+    offset, matched = matches_at(points, disparity, unit)
     right = points + offset
-    sigma = np.hypot(disparity_sigma, relief(points, disparity))
+    sigma = np.hypot(unit * disparity_sigma, template_planes(points, disparity, unit)[1])
     landmarks = triangulated(points, right, rig, T_local_left, sigma)
     depth = T_local_left.inverse().apply(landmarks.position)[:, 2]
     off, _ = distances(rig, np.zeros(len(NAMES)), points, right)
-    meets = matched & (depth > 0) & (np.abs(off) <= MAX_DISPARITY_STEP_PX)
+    meets = matched & (depth > 0) & (np.abs(off) <= unit * MAX_DISPARITY_STEP_PX)
     smooth = meets & np.isfinite(sigma)
     spread = np.linalg.norm(landmarks.per_pixel, axis=1) * sigma
     near = smooth & (spread <= MAX_RELATIVE_SIGMA * np.where(smooth, depth, 0.0))
@@ -112,8 +116,11 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
 
 
-def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
-    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree."""
+def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Bools]:
+    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree.
+
+    ``unit``: right pixels that :data:`MAX_DISPARITY_STEP_PX` counts in.
+    """
     validity = np.asarray(disparity["validity"])
     rows, cols = validity.shape
     inside = np.asarray(((points >= 0) & (points <= [cols - 1, rows - 1])).all(1))
@@ -128,21 +135,24 @@ def matches_at(points: Floats, disparity: Bundle) -> tuple[Floats, Bools]:
     corners = np.stack([np.asarray(disparity[n])[y4, x4] for n in ("column_disparity", "row_disparity")], -1)
     good = inside & (is_matched(validity[y4, x4]) & np.isfinite(corners).all(-1)).all(1)
     corners = np.where(good[:, None, None], corners, 0.0).astype(np.float64)
-    # Between two surfaces an interpolated disparity is that of neither.
-    apart = np.ptp(corners, axis=1)
-    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= MAX_DISPARITY_STEP_PX).all(1)
+    # Between two surfaces an interpolated disparity is that of neither. On one that is steep in disparity, as ground is
+    # to low cameras far from each other, or to a right one of finer pixels, neighbours differ by what its plane says.
+    on_plane = np.stack([x4, y4], -1) @ template_planes(points, disparity, unit)[0]
+    apart = np.minimum(np.ptp(corners, axis=1), np.ptp(corners - on_plane, axis=1))
+    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= unit * MAX_DISPARITY_STEP_PX).all(1)
 
 
-def relief(points: Floats, disparity: Bundle) -> Floats:
-    """Relief under each template: RMS (n,) of the disparities about their plane, pixels.
+def template_planes(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Floats]:
+    """Planes of the disparities under each template: slopes (n, 2, 2) along columns and rows, pixels a pixel, 0 where
+    nothing tells them; and the relief, the RMS (n,) of the disparities about them, pixels.
 
     A template on a rock's edge follows the rock or the ground, not the pixel at its centre; both the stereo match and
-    the track are then uncertain by the relief inside the template. NaN where that is beyond
+    the track are then uncertain by the relief inside the template. It is NaN where it is beyond
     :data:`MAX_DISPARITY_STEP_PX`, since then there are two surfaces, or where less than half of the template is
     matched.
     """
     if not len(points):
-        return np.zeros(0)
+        return np.zeros((0, 2, 2)), np.zeros(0)
     names = "column_disparity", "row_disparity", "validity"
     inside, windows = windows_at(points, HALF, *(np.asarray(disparity[name]) for name in names))
     column, row, valid = (window.reshape(len(points), -1) for window in windows)
@@ -156,4 +166,5 @@ def relief(points: Floats, disparity: Bundle) -> Floats:
     plane = irls(design[None], values, lambda _: use.astype(np.float64), 1e-9 * np.eye(3), rounds=1)
     rest = np.where(use[..., None], values - design @ plane, 0.0)
     rms = np.sqrt((rest**2).sum((1, 2)) / np.maximum(use.sum(1), 1))
-    return np.where((2 * use.sum(1) > dx.size) & (rms <= MAX_DISPARITY_STEP_PX), rms, np.nan)
+    told = (2 * use.sum(1) > dx.size) & (rms <= unit * MAX_DISPARITY_STEP_PX)
+    return plane[:, 1:] / HALF, np.where(told, rms, np.nan)

@@ -13,7 +13,7 @@ nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they tell a turned moun
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -132,6 +132,17 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 
 
+def at_best(departs: Callable[[float], tuple[float, str]], *, clocked: bool) -> str:
+    """How a sensor departs from the camera at all clocks, by the one at which it does least; empty: at one it does not.
+
+    ``departs``: by which share it departs with a clock that is so late, s, and how, see :func:`departure`; infinite
+    where nothing can be compared.
+    """
+    clocks = sorted(np.linspace(-OFFSET_SIGMA_S, OFFSET_SIGMA_S, 21), key=abs) if clocked else [0.0]
+    compared = [one for one in map(departs, clocks) if one[0] < math.inf]
+    return min(compared, key=lambda one: (bool(one[1]), one[0]), default=(0.0, ""))[1]
+
+
 @dataclass(frozen=True)
 class RelativePrior:
     """Poses ``T_reference_left`` (frame, 3, 4) by dead reckoning or attitude, NaN of none.
@@ -154,8 +165,7 @@ class RelativePrior:
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own trajectory contradicts it at all clocks; empty: it does not."""
-        shifts = [0.0] if self.times is None else sorted(np.linspace(-OFFSET_SIGMA_S, OFFSET_SIGMA_S, 21), key=abs)
-        return min((self._departure(own, shift) for shift in shifts), key=lambda one: one[0])[1]
+        return at_best(lambda shift: self._departure(own, shift), clocked=self.times is not None)
 
     def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
@@ -212,12 +222,13 @@ class RelativePrior:
 
 @dataclass(frozen=True)
 class Fixes:
-    """Positions (k, 3), m, moved to the moments of ``nodes`` (k,); ``antenna`` (k, 3) there by the camera, and its
-    ``velocity`` (k, 3), m/s."""
+    """Positions (k, 3), m, of a frame of their own; ``antenna`` (k, 3) at their moments by the camera, ``behind``
+    (k, 3), m, its way there from the nearest of the ``nodes`` (k,), and its ``velocity`` (k, 3), m/s."""
 
     nodes: NDArray[np.intp]
     positions: Floats
     antenna: Floats
+    behind: Floats
     velocity: Floats
 
 
@@ -247,7 +258,7 @@ class PositionPrior:
         return PositionPrior(np.pad(rows, ((0, 0), (0, lacking))), times, sigma, lever, clocked)
 
     def fixes(self, own: OwnTrajectory, late: float = 0.0) -> Fixes:
-        """Positions at the moments of the nearest nodes, by the camera's own way from the one to the other."""
+        """Positions beside the nearest nodes, and the camera's own way from there to their moments."""
         antenna = own.poses[:, :, 3] + own.poses[:, :, :3] @ self.lever
         at = self.times - late
         after = np.clip(np.searchsorted(own.times, at), 1, len(own.times) - 1)
@@ -257,28 +268,34 @@ class PositionPrior:
         usable = length <= MAX_GAP_STEPS * np.median(np.diff(own.times))
         usable &= (own.piece[after] == own.piece[after - 1]) & (part > -0.5) & (part < 1.5)
         velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
-        positions = self.positions + (own.times[near] - at)[:, None] * velocity
-        return Fixes(near[usable], positions[usable], antenna[near[usable]], velocity[usable])
+        # The antenna is moved, not the position: how the frame of positions is turned is not known yet.
+        behind = (at - own.times[near])[:, None] * velocity
+        there, of = antenna[near] + behind, usable
+        return Fixes(near[of], self.positions[of], there[of], behind[of], velocity[of])
 
     def contradiction(self, own: OwnTrajectory) -> str:
-        """Why the camera's own way in the plane contradicts the shape of the positions; empty: it does not."""
-        fixes = self.fixes(own)
+        """Why the camera's own way in the plane contradicts the shape of the positions at all clocks; empty: it does
+        not."""
+        return at_best(lambda late: self._departure(own, late), clocked=self.clocked)
+
+    def _departure(self, own: OwnTrajectory, late: float) -> tuple[float, str]:
+        """By which share of the camera's ways in the worst piece positions depart that are so late, s; why that is too
+        much."""
+        fixes, found = self.fixes(own, late), list[tuple[float, str]]()
         for k in enough(fixes, own.piece):
             mine = own.piece[fixes.nodes] == k
             way = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
             said = fit_plane(fixes.positions[mine], way).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
             share = float(np.hypot(*self.sigma[:2])) / math.sqrt(float((way**2).sum(1).mean()))
-            _, why = departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways")
-            if why:
-                return why
-        return ""
+            found.append(departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways"))
+        return max(found, key=lambda one: (bool(one[1]), one[0]), default=(math.inf, ""))
 
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
         """Factors of positions in the place; sources are three of the lever arm, and the clock."""
         fixes = self.fixes(own, late)
         count, turns = len(fixes.nodes), own.poses[fixes.nodes, :, :3]
         measured = np.tile(np.eye(3, 4), (count, 1, 1))
-        measured[:, :, 3] = self.laid.apply(fixes.positions)
+        measured[:, :, 3] = self.laid.apply(fixes.positions) - fixes.behind
         root, shared = np.zeros((count, 6, 6)), np.zeros((count, 6, 4))
         root[:, [0, 1, 2], [0, 1, 2]] = 1.0 / self.sigma
         # The arm that is stated less the true one.

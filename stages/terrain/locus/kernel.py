@@ -51,8 +51,8 @@ class Observed(NamedTuple):
 
     ``disparity`` (rows, cols, 2) right minus left, column and row, pixels, NaN where it must not be used; ``std``
     (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_residual`` and ``max_jump``
-    (in the bilinear cell) of a solution, pixels; ``scale`` pixels of the right image that one of the left one is
-    wide and high.
+    (in the bilinear cell) of a solution, pixels; ``axes`` (2, 2) where a column and a row of the left image lead in the
+    right one, see :func:`rille.stages.geometry.scale.axes`.
     """
 
     disparity: Floats32
@@ -60,7 +60,7 @@ class Observed(NamedTuple):
     image: Floats32
     max_residual: float
     max_jump: float
-    scale: tuple[float, float]
+    axes: Floats
 
 
 class Dem(NamedTuple):
@@ -344,14 +344,14 @@ def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
 def is_jump(disparity, seen, r, c):  # type: ignore[no-untyped-def]
     """Whether the disparities of the bilinear cell at row r and column c differ by more than ``max_jump``.
 
-    In pixels of the left image: what an unlike scale of the right one adds from pixel to pixel is no jump.
+    In pixels of the left image: what an unlike scale or a roll of the right one adds from pixel to pixel is no jump.
     """
-    total = 0.0
+    total, axes = 0.0, seen.axes
     for k in range(2):
         low, high = np.inf, -np.inf
         for i in range(2):
             for j in range(2):
-                value = disparity[r + i, c + j, k] - (seen.scale[k] - 1.0) * (i if k else j)
+                value = disparity[r + i, c + j, k] - (axes[k, 0] * j + axes[k, 1] * i - (i if k else j))
                 low, high = min(low, value), max(high, value)
-        total += ((high - low) / seen.scale[k]) ** 2
+        total += (high - low) ** 2 / (axes[k, 0] ** 2 + axes[k, 1] ** 2)
     return total > seen.max_jump**2

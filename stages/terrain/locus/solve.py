@@ -15,7 +15,7 @@ from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.geometry.scale import of_rig
+from rille.stages.geometry.scale import axes
 from rille.stages.terrain.locus.kernel import Cells, Dem, Observed, PairCameras, search
 
 COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
@@ -79,8 +79,7 @@ def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) 
     disparity[~matches.usable] = np.nan
     std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
     grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
-    wide, high = of_rig(rig)
-    return Observed(disparity, std, grey, params.max_residual, params.max_jump, (float(wide), float(high)))
+    return Observed(disparity, std, grey, params.max_residual, params.max_jump, axes(rig))
 
 
 def cameras_of(rig: Rig, T_local_left: RigidTransform) -> PairCameras:

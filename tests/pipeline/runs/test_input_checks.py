@@ -31,6 +31,11 @@ def test_baseline_and_sides(x, level):
     assert input_checks.judge_rig(rig(x)).level == level
 
 
+def test_a_right_camera_upside_down_stands_where_it_stands():
+    upside_down = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([0.12, 0.0, 0.0]))
+    assert input_checks.judge_rig(Rig(CAMERA, CAMERA, upside_down)).level == "OK"
+
+
 def test_two_lenses():
     assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 160.0, 120.0, 320, 240))).level == "WARN"
 

@@ -228,6 +228,13 @@ def test_what_cannot_be_calibrated_says_so():
         calibrate_rig(BOARD, swapped, SIZES, "radtan4")
 
 
+def test_a_right_camera_upside_down_stands_where_it_stands():
+    views, (width, height) = scene("radtan4", 6), SIZES[1]
+    turned = [BoardView(v.name, v.left, [width - 1, height - 1] - v.right) for v in views]
+    upright, upside_down = (calibrate_rig(BOARD, one, SIZES, "radtan4").T_right_left for one in (views, turned))
+    np.testing.assert_allclose(upside_down.inverse().translation, upright.inverse().translation, atol=1e-3)
+
+
 def test_one_view_repeated_is_refused_or_its_vagueness_told():
     one = scene("radtan4", 1, noise=0.1)[0]
     again = [BoardView(f"v{k}", one.left, one.right) for k in range(5)]

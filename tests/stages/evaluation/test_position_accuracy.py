@@ -233,6 +233,20 @@ def test_a_lever_arm_is_fitted_where_turns_show_it_and_said(offset):
     assert stated == pytest.approx(LEVER, abs=0.004)
 
 
+def test_an_arm_ahead_is_told_from_a_clock():
+    """Which both shift a drive along its way; found one after the other they share the error out."""
+    moments = np.arange(60) / RATE
+    heading, speed = 0.8 * np.sin(1.5 * moments), 5.0 + 2.5 * np.sin(2.0 * moments)
+    turns = Rotation.from_euler("z", heading[:, None]).as_matrix()
+    places = np.cumsum(speed[:, None] / RATE * turns[:, :, 1], axis=0)
+    ahead = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    antenna = places + 0.4 * turns[:, :, 1]
+    known = TruePositions(elsewhere(antenna, 1.0), moments)
+    found = position_accuracy(cameras(places, turns @ ahead), known, moments)
+    assert found.metrics["position_rmse"]["value"] < 0.02
+    assert found.metrics["time_offset"]["value"] == pytest.approx(0.0, abs=0.01)
+
+
 def test_a_stated_lever_arm_is_used_and_none_is_fitted_without_turns_or_to_what_is_no_lever_arm():
     R, antenna = mounted(0.6)
     rows = TruePositions(elsewhere(antenna, 1.0), lever_arm=LEVER)

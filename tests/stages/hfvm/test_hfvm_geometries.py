@@ -8,7 +8,8 @@ from rille.stages.core.validity import matched
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import as_matched
-from rille.stages.hfvm.level import FREE_BAND, State, hand_down
+from rille.stages.hfvm.level import FREE_BAND, PyramidPair, State, descend, hand_down, sample
+from rille.stages.hfvm.matcher import DEFAULT
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
@@ -48,6 +49,17 @@ def test_rows_without_any_match_are_predicted_along_their_columns():
     state = State(1, Map(chance, chance), Map(chance, chance), ok, ok, FREE_BAND, -1.0)
     for predicted in hand_down(state, HfvmParams()):
         assert (predicted == 5).all()
+
+
+def test_lines_are_fitted_to_what_shows_something():
+    """Not to the space around a body, which is black in both images and so agrees at no displacement."""
+    images = pair(lambda x, y: (-14 + 4 * np.sin(x / 25) * np.sin(y / 30), 9.0 + 0 * x), SHAPE)[:2]
+    black = [as_matched(build(np.pad(a, 150), PyramidParams()), HfvmParams()) for a in images]
+    images = PyramidPair(*black, HfvmParams(), DEFAULT)
+    state = descend(images, 1)
+    found = sample(images, state)
+    assert (images.left.layers[1].deviation[found.y, found.x] > 0).all()
+    assert np.median(found.v) == pytest.approx(4.5, abs=0.1)
 
 
 def on_plane(h, share=1.0, level=2):

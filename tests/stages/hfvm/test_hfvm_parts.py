@@ -11,10 +11,10 @@ from scipy import ndimage
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, level, paper, plane, refinement
-from rille.stages.hfvm.finest import FAILED_PX, backmatch, isolated
+from rille.stages.hfvm.finest import FAILED_PX, Fine, FinestWork, backmatch, isolated, speckles
 from rille.stages.hfvm.image import Window, as_matched
 from rille.stages.hfvm.image import planes as table_1
-from rille.stages.hfvm.level import Map, agree
+from rille.stages.hfvm.level import Map, PyramidPair, Recipe, agree
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 from rille.stages.imaging.pyramid import PyramidParams, build
@@ -362,3 +362,16 @@ def test_values_and_gradients_are_those_of_scipys_spline():
     np.testing.assert_allclose(-rest, value(0, 0), atol=5e-3)
     np.testing.assert_allclose(gx, (value(1e-4, 0) - value(-1e-4, 0)) / 2e-4, atol=2e-2)
     np.testing.assert_allclose(gy, (value(0, 1e-4) - value(0, -1e-4)) / 2e-4, atol=2e-2)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_patches_differ_in_what_shows_depth(upright):
+    odd, even = np.zeros((60, 80), np.int16), np.zeros((60, 80), np.int16)
+    odd[20:24, 30:36] = 9
+    nothing = np.zeros(odd.shape, np.float32)
+    fine = Fine(nothing, nothing, np.zeros(odd.shape, np.uint8), nothing, nothing, nothing)
+    image = as_matched(build(np.full(odd.shape, 90, np.uint8), PyramidParams()), HfvmParams())
+    images, layer = PyramidPair(image, image, HfvmParams(), Recipe((), (), (0, 0))), image.layers[0]
+    there = Map(even, odd) if upright else Map(odd, even)
+    found = speckles(FinestWork(layer, layer, layer, there, there, images, upright=upright), fine)
+    np.testing.assert_array_equal(found.validity != 0, odd != 0)

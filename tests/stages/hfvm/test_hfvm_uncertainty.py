@@ -140,3 +140,17 @@ def test_unrefined_disparities_have_one_too(params):
     ok = matched(found.validity)
     inside = np.abs(found.column_disparity - u)[ok] <= found.disparity_std[ok]
     assert 0.55 < inside.mean() < 0.95
+
+
+def test_of_cameras_one_above_the_other_it_is_that_of_the_rows():
+    """As both images turned by a quarter show: the same pixels are as sure."""
+
+    def bumps(x, y):
+        return -20 + 0.04 * x + 2.0 * np.sin(x / 5) * np.cos(y / 6), 0.0
+
+    images = pair(bumps, (200, 240), noise=2.0)[:2]
+    plain, turned = match(*images), match(*(np.rot90(image, -1).copy() for image in images))
+    both = matched(plain.validity) & np.rot90(matched(turned.validity))
+    ratio = np.rot90(turned.disparity_std)[both] / plain.disparity_std[both]
+    assert both.mean() > 0.7
+    assert np.quantile(np.abs(np.log(ratio)), 0.9) < 0.1

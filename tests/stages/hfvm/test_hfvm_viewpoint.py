@@ -43,6 +43,17 @@ def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     assert np.mean(matched(match(left, right, HfvmParams(without=("turn",))).validity)) < 0.02
 
 
+@pytest.mark.parametrize("degrees", [90, 150])
+def test_a_scene_that_is_brighter_at_one_end_is_turned_with_its_light(degrees):
+    left, right, u, v = turned(degrees)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    x, (rows, cols) = np.indices(SHAPE)[1], np.indices(RIGHT)
+    there = (cols - RIGHT[1] / 2) * c + (rows - RIGHT[0] / 2) * s
+    lit = [0.6 * a * np.exp(d / 130) for a, d in ((left, x - SHAPE[1] / 2), (right, there))]
+    found = match(*(np.clip(a, 0, 255).astype(np.float32) for a in lit))
+    assert np.mean(matched(found.validity)[seen(u, v, right.shape, 12)]) > 0.95
+
+
 @pytest.mark.parametrize(("preset", "degrees", "wide"), [("fast", 180, 0.2), ("accurate", 150, 0.1)])
 @pytest.mark.parametrize("known", [False, True])
 def test_other_presets_match_turned_views_alike(preset, degrees, wide, known):

@@ -109,3 +109,12 @@ def test_grey_of_each_kind() -> None:
     assert grey_bytes(np.array([[0, 257, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
     assert grey_bytes(np.array([[-3.0, 1.6, 300.0, np.nan]], np.float32)).tolist() == [[0, 2, 255, 0]]
     assert grey_bytes(np.array([[7]], np.uint8)).tolist() == [[7]]
+
+
+def test_of_two_features_that_look_alike_to_the_last_bit_neither_matches() -> None:
+    values = np.random.default_rng(0).integers(0, 90, (6, 128)).astype(np.float32)
+    values = np.rint(values * (512 / np.linalg.norm(values, axis=1, keepdims=True)))
+    twice = np.concatenate([values, values[:1]])
+    others = [[k, k] for k in range(1, 6)]
+    assert match(values, values).tolist() == [[0, 0], *others]
+    assert match(twice, values).tolist() == match(values, twice).tolist() == others

@@ -78,7 +78,11 @@ def test_a_sensor_joins_pieces_within_its_errors(sensor):
     assert 0.2 < nees(out, truth) < 3.0
 
 
-@pytest.mark.parametrize("sensor", [odometry, gnss])
+def exact(truth, rng, late):
+    return gnss(truth, rng, sigma=0.05, late=late)
+
+
+@pytest.mark.parametrize("sensor", [odometry, gnss, exact])
 def test_a_clock_that_is_late_is_found_and_stated(sensor):
     truth, rng = winding(), np.random.default_rng(2)
     segments, before = run_of(truth, rng)
@@ -202,6 +206,20 @@ def test_positions_say_where_the_world_lies():
     assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+def test_how_the_frame_of_positions_is_turned_changes_nothing():
+    """Nor where their moments lie between those of the images."""
+    truth, rng = winding(), np.random.default_rng(9)
+    segments, before = run_of(truth, rng)
+    points, between, found = np.array([T.translation for T in truth]), TIMES[:-1] + 0.045, []
+    points = np.stack([np.interp(between, TIMES, axis) for axis in points.T], axis=1)
+    for angle in (0.0, 0.5 * np.pi):
+        given = {"positions": (points @ rotation_exp([0, 0, angle])).tolist(), "times": between.tolist()}
+        given |= {"sigma": [0.05] * 3, "lever": [0.0] * 3}
+        found.append(adjusted(segments, before, {**BASE, "positions": given}))
+        assert not [line for line in found[-1].meta["warnings"] if line.startswith("[")]
+    np.testing.assert_allclose(found[0]["poses"], found[1]["poses"], atol=1e-6)
 
 
 def test_the_vertical_holds_a_chain_upright():

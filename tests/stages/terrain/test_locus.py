@@ -21,7 +21,7 @@ from terrain_scenes import (
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import view_ground
@@ -92,6 +92,18 @@ def test_a_rig_whose_right_camera_is_ahead() -> None:
     # Here the baseline that counts is its part across the ray, so the bound is the kernel's own sensitivity.
     errors = interpolation_error(*(np.where(maps[2], m, np.nan) for m in maps[:2])) + 1e-3
     assert (np.abs(dem.elevation - truth) <= 1.5 * dem.elevation_std * errors / PARAMS.sigma_disparity)[seen].all()
+
+
+@pytest.mark.parametrize("roll_deg", [90.0, 180.0])
+def test_a_right_camera_that_is_rolled_sees_no_jumps_of_its_own(roll_deg: float) -> None:
+    roll = RigidTransform(rotation_exp([0.0, 0.0, math.radians(roll_deg)]), np.zeros(3))
+    square = [Camera(300.0, 300.0, 159.5, 159.5, 320, 320)] * 2
+    found = [
+        np.isfinite(solve(disparity(one, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT)), (-1.0, -0.3), one).elevation)
+        for one in (Rig(*square, RIG.T_right_left), Rig(*square, roll @ RIG.T_right_left))
+    ]
+    assert (found[0] == found[1]).mean() > 0.98
+    assert found[1].mean() > 0.8
 
 
 def scaled(scale: float) -> Rig:

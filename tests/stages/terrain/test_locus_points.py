@@ -40,7 +40,7 @@ PLAIN = np.ones((HEIGHT, WIDTH), np.float32)
 
 
 def observed(disparity: np.ndarray, max_residual: float = 1.0, max_jump: float = 1.0) -> Observed:
-    return Observed(disparity.astype(np.float32), PLAIN, PLAIN, max_residual, max_jump, np.ones(2))
+    return Observed(disparity.astype(np.float32), PLAIN, PLAIN, max_residual, max_jump, np.eye(2))
 
 
 def cells(n: int = 20, spread: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
