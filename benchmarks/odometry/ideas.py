@@ -49,14 +49,17 @@ def _no_change(origin: Any, moved: Any, use: Any, at: Any) -> Any:
     return np.tile(np.eye(2), (len(at), 1, 1)), np.tile(shift, (len(at), 1))
 
 
+def _level(points: Any, disparity: Any, unit: float = 1.0) -> Any:
+    """Disparities under templates that neither slope nor have relief."""
+    return np.zeros((len(points), 2, 2)), np.zeros(len(points))
+
+
 IDEAS = (
     Idea("as it is"),
     Idea("no joint adjustment", ("resect.joint=false",)),
     Idea("no error that all disparities share", ("resect.bias_sigma=0",)),
     Idea("landmarks taken as exact", ("resect.disparity_sigma=0.001",)),
-    Idea(
-        "no relief under templates", name="odometry.resection.landmarks.relief", function=lambda p, d: np.zeros(len(p))
-    ),
+    Idea("templates on level ground", name="odometry.resection.landmarks.template_planes", function=_level),
     Idea("no affinity of the neighbours", name="odometry.track.fit_affinity", function=_no_change),
     Idea("points aligned one way only", name="odometry.track.MAX_RETURN_PX", function=1e9),
     Idea("no new points in empty parts", name="odometry.track._reseed", function=lambda state, *given: state),

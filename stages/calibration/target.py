@@ -116,8 +116,6 @@ def calibrate_rig(
     ------
     DegenerateError
         There are too few views, or they do not determine the cameras.
-    InputError
-        The right camera stands on the left one's left.
     """
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
@@ -132,9 +130,6 @@ def calibrate_rig(
     # From the first solution, now without the bad views' poses.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
     rig = used.rig(x)
-    if rig.centre[0] < -SWAPPED * rig.baseline:
-        text = f"the right camera stands {-rig.centre[0]:.4g} m to the left of the left one"
-        raise InputError("RIL-310", text, remedy="swap the two sets of images")
     final = {r.name: r for r in used.residuals(x)}
     rms, sigma = used.errors(x)
     left, right = used.lenses(x)
@@ -147,6 +142,14 @@ def calibrate_rig(
         rms,
         tuple(final.get(r.name, ViewResidual(r.name, r.left, r.right, r.epipolar, used=False)) for r in first),
     )
+
+
+def check_sides(rig: RigCalibration) -> None:
+    """Refuse cameras of which the right one stands on the left one's left (RIL-310); only views that fit tell that."""
+    centre = rig.T_right_left.inverse().translation
+    if centre[0] < -SWAPPED * float(np.linalg.norm(centre)):
+        text = f"the right camera stands {-centre[0]:.4g} m to the left of the left one"
+        raise InputError("RIL-310", text, remedy="swap the two sets of images")
 
 
 def _enough(views: Sequence[BoardView]) -> None:

@@ -24,7 +24,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_new, check_output
-from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig
+from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig, check_sides
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
 
@@ -116,6 +116,7 @@ def calibrate(
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
+    check_sides(rig)
     atomic.write(output, _yaml(rig, boards, square))
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {square:g} m")

@@ -158,10 +158,10 @@ def local_planner_stage(
     whole: bool = False,
 ) -> Bundle[LegFacts]:
     """The next leg of a drive to a goal, over ground that is known to be free."""
-    T_left_vehicle = T_vehicle_left.inverse()
+    driven = np.zeros((0, 3, 4)) if inputs.driven is None else np.asarray(inputs.driven["poses"])
     stand, *track = (
-        from_above(RigidTransform.from_matrix(pose) @ T_left_vehicle)
-        for pose in (np.asarray(inputs.pose["poses"])[-1], *(() if inputs.driven is None else inputs.driven["poses"]))
+        from_above(RigidTransform.from_matrix(T_world_left) @ T_vehicle_left.inverse())
+        for T_world_left in (np.asarray(inputs.pose["poses"])[-1], *driven[np.isfinite(driven).all((1, 2))])
     )
     end = (float(goal[0]), float(goal[1]))
     memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed], track=track)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig
+from rille.stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig, check_sides
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -225,7 +225,7 @@ def test_what_cannot_be_calibrated_says_so():
         calibrate_rig(BOARD, views[:2], SIZES, "radtan4")
     swapped = [BoardView(v.name, v.right, v.left) for v in views]
     with raises("RIL-310"):
-        calibrate_rig(BOARD, swapped, SIZES, "radtan4")
+        check_sides(calibrate_rig(BOARD, swapped, SIZES, "radtan4"))
 
 
 def test_a_right_camera_upside_down_stands_where_it_stands():
