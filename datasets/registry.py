@@ -145,11 +145,13 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
     remedy = (
-        f"give its manifest, {beside}"
-        if beside.is_file()
-        else f"`rille init {shlex.quote(str(name_or_path))}` writes a manifest; `rille datasets list` names what opens"
+        f"`rille init {shlex.quote(str(name_or_path))}` writes a manifest; `rille datasets list` names what opens"
         " without one"
     )
+    if beside.is_file():
+        remedy = f"give its manifest, {beside}"
+    elif (path / "report.json").is_file():
+        remedy = "it is a run, not a sequence: `rille view` shows it, and rille.open_run reads it"
     raise InputError("RIL-277", f"{name_or_path} has no layout that is recognised", remedy=remedy)
 
 

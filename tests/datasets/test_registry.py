@@ -83,6 +83,11 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
     (tmp_path / "field.rille.toml").touch()
     with raises("RIL-277", f"give its manifest, {folder}.rille.toml"):
         open_sequence(str(folder))
+    run = tmp_path / "runs" / "field"
+    run.mkdir(parents=True)
+    (run / "report.json").touch()
+    with raises("RIL-277", "rille.open_run reads it"):
+        open_sequence(str(run))
     with raises("RIL-276", "no file 'field.toml'"):
         open_sequence("field.toml")
     with raises("RIL-992", "field.rille.txt is no sequence"):
