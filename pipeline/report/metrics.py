@@ -25,6 +25,8 @@ LABELS: Mapping[str, str] = {
     "rpe_rotation_rmse": "Relative error, rotation",
     "scale_error": "Scale",
     "nees": "Squared error over the claimed one (NEES)",
+    "nees_position": "The same, positions",
+    "nees_rotation": "The same, rotations",
     "frames_missing": "Frames without a pose in the world",
     "rmse": "Elevation error, RMS",
     "nmad": "Elevation error, robust deviation (NMAD)",

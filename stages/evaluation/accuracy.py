@@ -8,7 +8,8 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 * RPE: ``(Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1)`` of successive frames (Sturm et al. 2012, doi:10.1109/IROS.2012.6385773);
 * drift: error of the last position after making the first poses equal, over the true length of the path;
 * scale: least-squares factor between the lengths of the motions of successive frames;
-* NEES: mean squared error over the claimed one, per degree of freedom: 1 where the claims are right.
+* NEES: mean squared error over the claimed one, per degree of freedom: 1 where the claims are right; of whole poses,
+  of positions and of rotations, since a truth may be good in one and poor in the other.
 """
 
 from __future__ import annotations
@@ -30,6 +31,13 @@ from rille.stages.odometry.resection.trajectory import world_poses
 
 MIN_MOVED_M = 1e-6
 """Length of the true path below which a camera counts as at rest, and has no scale error."""
+
+CLAIMS = (
+    ("nees", slice(0, 6), ""),
+    ("nees_position", slice(0, 3), ", of positions alone"),
+    ("nees_rotation", slice(3, 6), ", of rotations alone"),
+)
+"""Figures of the covariances: name, rows of a covariance that are judged, and what they are in words."""
 
 
 def trajectory_accuracy(
@@ -66,7 +74,8 @@ def trajectory_accuracy(
         figures["drift"] = metric("fewer than two frames have a pose and truth", "%", "")
     if covariance is not None and len(judged) > 1:
         how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
-        figures["nees"] = metric(nees(estimate, aligned, covariance), "", how)
+        for name, part, whose in CLAIMS:
+            figures[name] = metric(nees(estimate, aligned, covariance, part), "", how + whose)
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
 
 
@@ -131,11 +140,11 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     return {"scale_error": metric(100.0 * (scale - 1.0), "%", how)}
 
 
-def nees(P: Floats, aligned: Floats, covariance: Floats) -> float | str:
+def nees(P: Floats, aligned: Floats, covariance: Floats, part: slice = slice(0, 6)) -> float | str:
     """Mean squared error over the claimed one, per degree of freedom; or why it does not apply.
 
     ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
-    exact: ``aligned`` is the truth with the first poses made equal.
+    exact: ``aligned`` is the truth with the first poses made equal. ``part``: which of the six are judged.
     """
     claimed = posed(P) & posed(covariance)
     known = claimed & posed(aligned)
@@ -147,8 +156,9 @@ def nees(P: Floats, aligned: Floats, covariance: Floats) -> float | str:
         return "a covariance is singular"
     turn = rotation_log(aligned[rows, :, :3] @ np.swapaxes(P[rows, :, :3], 1, 2))
     error = np.concatenate([aligned[rows, :, 3] - P[rows, :, 3], turn], axis=1)
-    weighed = np.linalg.solve(covariance[rows], error[..., None])[..., 0]
-    return float((error * weighed).sum(1).mean()) / 6.0
+    error = error[:, part]
+    weighed = np.linalg.solve(covariance[rows, part, part], error[..., None])[..., 0]
+    return float(np.mean(error * weighed))
 
 
 def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:

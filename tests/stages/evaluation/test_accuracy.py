@@ -228,6 +228,11 @@ def test_right_claims_give_one_and_halved_deviations_four() -> None:
     value = nees(estimate, true, covariance)
     assert value == pytest.approx(1.0, abs=5 * (2 / 6 / n) ** 0.5)
     assert nees(estimate, true, covariance / 4) == pytest.approx(4 * value)
+    # Rotations claimed ten times too exactly: that is said of them alone.
+    small = np.diag([1.0] * 3 + [0.1] * 3)
+    figures = trajectory_accuracy(estimate, true, small @ covariance @ small)[1]
+    assert figures["nees_position"]["value"] == pytest.approx(1.0, rel=0.1)
+    assert figures["nees_rotation"]["value"] == pytest.approx(100.0, rel=0.1)
 
 
 def test_covariances_reach_the_figures() -> None:
