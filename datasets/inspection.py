@@ -27,7 +27,7 @@ from rille.datasets.poses import names_positions, read_positions
 from rille.datasets.text.reading import Search, is_file, read_lines
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
-from rille.stages.geometry.geometry import Sizes
+from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 DEPTH = 4
 """Folders below the given one that are looked into; more is another data set."""
@@ -75,7 +75,8 @@ class FoundImages:
 class FoundCalibration:
     """Calibration files that suit: one for both cameras or one each, relative to the folder.
 
-    ``names``: which two of its cameras, where the file has more.
+    ``names``: which two of its cameras, where the file has more. ``mount``: T_reference_left, where the reference frame
+    of the files is another one than the left camera's, most often that of the body or of the IMU.
     """
 
     files: tuple[str, ...]
@@ -83,6 +84,7 @@ class FoundCalibration:
     baseline: float | None
     cameras: int
     names: tuple[str, str] | None = None
+    mount: RigidTransform | None = None
 
     def suits(self, sizes: Sizes | None) -> bool:
         """Whether it is of images of these sizes, as far as both are known."""
@@ -287,7 +289,8 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Fou
     baseline = None
     if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
         baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    return FoundCalibration(names, (cameras[0].size, cameras[-1].size), baseline, len(cameras))
+    mount = None if poses[0] is None or np.allclose(poses[0].matrix34, np.eye(3, 4)) else poses[0].inverse()
+    return FoundCalibration(names, (cameras[0].size, cameras[-1].size), baseline, len(cameras), mount=mount)
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any
 
 import tomli_w
 
-from rille.datasets.inspection import Findings, FoundImages
+from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
 from rille.datasets.manifest.rig import LONGEST_BASELINE
 from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
@@ -35,7 +35,16 @@ def manifest_text(found: Findings, root: str) -> str:
         pairs=pair_words(found.views),
         sizes=size_words,
         longest_baseline=LONGEST_BASELINE,
+        mount=_mount(found.calibration),
     )
+
+
+def _mount(calibration: FoundCalibration | None) -> str:
+    """Where the left camera stands in the body that the calibration is of, as the value of a key, or an example."""
+    if calibration is None or calibration.mount is None:
+        return "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
+    rows = ", ".join(f"[{', '.join(f'{x:.9g}' for x in row)}]" for row in calibration.mount.matrix34)
+    return f"[{rows}]  # by the calibration, if its body is this one"
 
 
 def _value(value: Any) -> str:

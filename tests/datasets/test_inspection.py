@@ -486,3 +486,15 @@ def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path):
     with pytest.raises(InputError) as caught:
         inspect(tmp_path / "one")
     assert "both views" not in str(caught.value)
+
+
+def test_the_body_of_the_calibration_is_offered_for_poses_of_it(tmp_path):
+    write_images(tmp_path, ["left4.png", "right4.png"])
+    for side, x in (("left", 0.5), ("right", 0.6)):
+        (tmp_path / f"cam_{side}.tsai").write_text(TSAI.format(x=x))
+    write_lines(tmp_path / "poses.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"])
+    text = manifest_text(inspect(tmp_path), ".")
+    line = "T_body_left = [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0]]"
+    assert f"# {line}  # by the calibration" in text
+    (tmp_path / "m.rille.toml").write_text(text.replace(f"# {line}", line))
+    assert open_manifest(tmp_path / "m.rille.toml", Digests()).truth_mount.translation[0] == 0.5
