@@ -1,4 +1,4 @@
-"""Robust adjustment of a rig to correspondences of one or several pairs, with what no rig explains beside it.
+"""Robust adjustment of a rig to correspondences of one or several pairs, together with errors that no rig explains.
 
 Beside the five parameters of the rig (:mod:`rille.stages.geometry.epipolar`) the images hold errors that no number of
 matches averages out, and a fit without them claims a precision it does not have. They are estimated with a prior and

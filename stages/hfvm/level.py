@@ -1,7 +1,8 @@
-"""One level of the matcher (paper, 4.3.4): both images onto each other, what is consistent, and the epipolar band.
+"""One level of the matcher (paper, 4.3.4): each image matched to the other, the check of both, and the epipolar band.
 
-A level is a list of steps, each of which improves displacements: search, propagation, paths, median, depth edges. What
-is not consistent is interpolated along its row and handed down."""
+A level is a list of steps, each of which improves displacements: search, propagation, paths, median, depth edges.
+Displacements that fail the check are interpolated along their row for the next finer level.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Other sensors beside the camera: which of them are believed, how late their clocks are, and what is said of them.
+"""Other sensors beside the camera: which of them are used, the offsets of their clocks, and the warnings about them.
 
-What they say is in :mod:`rille.stages.odometry.resection.sensors`; a sensor that contradicts the chain, or most of
-whose factors the adjusted graph leaves out, is not used.
+Their measurements are factors (:mod:`rille.stages.odometry.resection.sensors`). A sensor that contradicts the chain, or
+most of whose factors the adjusted graph leaves out, is not used.
 """
 
 from __future__ import annotations
