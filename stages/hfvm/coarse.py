@@ -1,4 +1,4 @@
-"""The coarse levels of a pair: prior disparities, correction of brightness, alignment by a plane or keypoints, matching.
+"""Coarse levels of a pair: prior disparities, correction of brightness, alignment by a plane or keypoints, matching.
 
 Known disparities replace those of the coarse levels at the level on which pre-alignment is decided (2), so that they
 serve that decision too, and are refined from there on like any other match. A search of one pixel at each level below

@@ -1,4 +1,4 @@
-"""Coarse displacements between two frames: their values at points, the affinities that they show; windows about points."""
+"""Coarse displacements between two frames, at points, and the affinities that they show; windows about points."""
 
 from __future__ import annotations
 
