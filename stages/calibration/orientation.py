@@ -99,7 +99,7 @@ def orientation_stage(params: OrientationParams, disparity: Bundle, *, rig: Rig,
     left, right = thin(
         disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
     )
-    # what the stage rig will read, to the last bit
+    # rounded to float32, as stage rig will read them
     points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
     matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     weight, facts = orient(rig, matches)

@@ -61,12 +61,12 @@ def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float)
     slope : (rows, cols) metres a metre.
     cell : metres.
     """
-    # What no model tells: with nothing of it, flat cells would have no error at all.
+    # Where no model states a standard deviation take the spread of the differences: else flat cells had none.
     known = np.where(np.isfinite(sigma) & (sigma > 0), sigma, mad_sigma(error[np.isfinite(error)]))
     expected = np.hypot(known, SHIFT_CELLS * cell * np.nan_to_num(slope))
     usable = np.isfinite(error) & (expected > 0)
     ratio = error[usable] / expected[usable]
-    # Two models may have errors in common; what they state is not undercut for that.
+    # Errors that two models share cancel in the difference; the stated standard deviations are never reduced for that.
     return np.asarray(expected * max(mad_sigma(ratio) if ratio.size else 1.0, 1.0))
 
 

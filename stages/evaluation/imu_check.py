@@ -52,7 +52,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
         return []
-    # A camera that hardly turns is fitted by all axes alike: those that are given come first.
+    # If the camera hardly turns all axes fit alike: then the stated ones are preferred.
     given = [0.1 * off[0] * (S is signed_axes()[0]) for _, S in readings]
     best = int(np.argmin(np.subtract(off, given)))
     factor, S = readings[best]

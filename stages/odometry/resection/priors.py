@@ -136,7 +136,7 @@ class Sensors:
         """
         clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
         done = None
-        # Clocks first, by which what is left of the errors then tells more of the chain's.
+        # First the clocks: the remaining errors then show better by how much the chain's exceed its covariances.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
             said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
             groups = {name: factors for name, factors in said.items() if len(factors.ends)}
