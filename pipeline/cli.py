@@ -93,9 +93,9 @@ def main(argv: list[str] | None = None) -> None:
     with plain_output():
         try:
             code = _run(argv)
-            # Here, where a reader that has gone is still an exception: at exit Python would print a traceback.
+            # Flushed here, where a closed pipe can be caught: at exit Python would print a traceback.
             sys.stdout.flush()
-        except BrokenPipeError:  # who read the output has had enough of it
+        except BrokenPipeError:  # the reader of the output closed it
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             code = FAILED
     sys.exit(code)

@@ -564,7 +564,7 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     from rille.pipeline.flow import config
 
     settings: dict[str, Any] = {}
-    # The last wins: what suits the sequence, what the step before was given, what is given now.
+    # Later layers win: settings of the sequence, settings of the step before, settings of this call.
     for layer in (*more[:-1], _settings(data), more[-1]):
         config.merge(settings, layer)
     return settings

@@ -1,4 +1,4 @@
-"""Stage ``image``: one image file, checked and grey. And what a reader of folders asks of files beforehand."""
+"""Stage ``image``: one image file, checked and grey. Also checks of image files for the readers of folders."""
 
 from __future__ import annotations
 

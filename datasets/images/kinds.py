@@ -1,4 +1,4 @@
-"""Files that are no images, calibrations or tables that are read: by their endings, what they are and what to do."""
+"""Kinds of files that Rille does not read, by their endings: what they are, and how to convert them."""
 
 from __future__ import annotations
 

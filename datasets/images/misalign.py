@@ -1,7 +1,7 @@
-"""Any sequence as if its right camera had been knocked: for trying out what a wrong calibration does.
+"""Any sequence as if its right camera had been knocked, to try the effect of a wrong calibration.
 
-The right images are warped as the turned camera would have taken them, while the rig that is *given* stays. So the
-turn is what stage ``rig`` should find (its corrections pitch, yaw, roll have these signs), and truth stays true.
+The right images are warped as the turned camera would have taken them, while the rig that is *given* stays. So the turn
+is what stage ``rig`` should find (its corrections pitch, yaw, roll have these signs), and truth stays true.
 """
 
 from __future__ import annotations

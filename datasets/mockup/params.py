@@ -1,4 +1,4 @@
-"""What can be varied in the simulated experiment, and what each half of it (bed, camera) needs to know.
+"""Parameters of the simulated experiment, and the parts of them that bed and camera read.
 
 The figures are the paper's (sections 3.2, 7.1-7.4) where it gives them.
 """

@@ -1,11 +1,11 @@
 """The simulated experiment as a sequence, recorded or driven: where the cameras stand, what is given and known.
 
-A driven rover moves by what the chain makes of its images.
+A driven rover moves as the closed loop decides from its images.
 
 Frames: the bed frame (truth) has z up, y ahead, x right and its origin in the middle of the bed's near edge at mean
-height. The body frame moves with the rig: y ahead, x along the baseline to the right, z up, origin between the
-cameras. Each camera is turned inward about the body's z axis by the toe-in and then downward by the pitch about its
-own horizontal axis, so that with a level body both cameras have exactly that pitch and no roll.
+height. The body frame moves with the rig: y ahead, x along the baseline to the right, z up, origin between the cameras.
+Each camera is turned inward about the body's z axis by the toe-in and then downward by the pitch about its own
+horizontal axis, so that with a level body both cameras have exactly that pitch and no roll.
 """
 
 from __future__ import annotations

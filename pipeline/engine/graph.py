@@ -260,7 +260,7 @@ class Graph:
             wanted = self._wait(steps, step)
         except MissingError as error:
             self.unfinished -= 1
-            # Never to go on: the run's end says what it waited for.
+            # The flow never goes on; the end of the run names the tasks that it waited for.
             self.expansions.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
         if wanted is None or idle:

@@ -63,7 +63,7 @@ def total() -> int:
 def free() -> int:
     """Memory that this process and its children may still take, bytes."""
     machine = psutil.virtual_memory()
-    # Within a control group what its other processes hold is not known here: the limit counts without this process.
+    # The memory of other processes in the control group is unknown here: only that of this one is subtracted.
     return max(0, min(int(machine.available), total() - resident()))
 
 

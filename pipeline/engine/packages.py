@@ -44,7 +44,7 @@ def versions(module: str) -> dict[str, str]:
     RilleError
         One of them is not installed.
     """
-    # Without what checks parameters, whose values are in the key, the engine, whose format is, and types
+    # Left out: pydantic, which only checks parameters, whose values are in the key; the engine; and types.
     names = external_imports(module) - frozenset({"pydantic", "rille", "typing_extensions"})
     if "numba" in names:
         names.add("llvmlite")  # generates the code

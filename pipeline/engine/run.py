@@ -352,7 +352,7 @@ class _Run:
     def _resolve(self, handle: Handle, status: str) -> None:
         handle.status = status
         self.ledger.write(handle)
-        if handle.index not in self.before:  # healed: it counts once, as what became of it last
+        if handle.index not in self.before:  # a task that was computed again counts once
             self.progress.resolved(handle)
 
     def _skip(self, handle: Handle, missing: Handle) -> None:
@@ -467,10 +467,10 @@ class _Run:
         self.result.assumed += assumed
         try:
             waiting.go_on(*(h.ref or h.earlier for h in waiting.handles))
-        except BrokenPipeError:  # who read what the flow prints has had enough of it
+        except BrokenPipeError:  # the reader of the flow's output closed it
             raise
         except Exception as error:
-            if assumed:  # what was found with other parameters or images does not fit: no more can be said
+            if assumed:  # assumed results of other parameters or images do not fit: the rest is unknown
                 self.result.unknown += assumed
             else:
                 label = f"plan after {_labels(waiting.handles)}"

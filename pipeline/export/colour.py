@@ -1,8 +1,9 @@
 """The ortho image of a run in colour, where its left images have colours.
 
-Matching, elevation models and their merging know grey values alone, and the merged grey is evened out between the
-models. Colour is brought to it afterwards: each cell takes the colour that the left image of the pair of its greatest
-weight shows there, less that colour's own grey, added to the merged grey. So colours have no seams of exposure.
+Matching, elevation models and their merging use grey values alone, and the merged grey is free of differences of
+exposure. Colour is added afterwards: for each cell the left image of the pair with the greatest weight there gives the
+difference between each colour channel and the image's grey, which is added to the merged grey. So colours have no seams
+of exposure.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The task of an output: what its writer takes of a run as arguments and inputs of a node of the graph.
 
-No module that declares outputs imports this one: what it makes a task of is in the task's key, the graph's code is not.
+Modules that declare outputs do not import this one, so that the code of the graph is in no key of an output.
 """
 
 from __future__ import annotations

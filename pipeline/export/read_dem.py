@@ -327,7 +327,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # Before what follows: a file that cannot be read is refused, one that says something else has no cameras.
+    # Read outside of the try: an unreadable file is an error, while one with other contents has no cameras.
     lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run)
     try:
         poses, place = np.loadtxt(lines, ndmin=2), _place(frames)

@@ -2,9 +2,9 @@
 
 A parameter counts as set if it is in force with another value than it would have without ``--set`` and ``--config``:
 the ``config.toml`` of a run, which holds all parameters, can be given back. It is read if a task of the run has its
-section for parameters or arguments. What stands in a section that the user himself has switched off
-(``crosscheck.enabled=false``) may stay; a section that is off anyway reads nothing, and the remedy says how to switch
-it on.
+section for parameters or arguments. Parameters of a section that the user has switched off
+(``crosscheck.enabled=false``) are permitted. A section that is off by default reads nothing, and the remedy says how to
+switch it on.
 
 Before anything is computed it is known which sections no task of such a run can read (of a drive those of a
 reconstruction, and the other way round). The rest is known when all tasks are: then the run ends with its results, the

@@ -1,8 +1,8 @@
 """Delivered, absent (not asked for, or not possible with the data) and missing results, each from its facts.
 
-A path over the whole map that was looked for and is not there is missing, though it is an answer: who reads "nothing
-is missing" takes it for granted. A stop from which no safe ground leads lacks nothing: that is what it was asked. Truth
-that the data do not have and a comparison that is switched off are not missing.
+If no path over the whole map exists, the path is listed as missing, although this is a valid answer: a reader of
+"nothing is missing" would expect a path. A single stop without a path lacks nothing. Truth that the data do not have,
+and a comparison that is switched off, are not missing.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Two images of cameras of which nothing is known: their grey values, and whether they belong together."""
+"""Two images without calibration: spread their grey values, and say whether they seem not to belong together."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def find(text: str, runs: Path) -> Path:
     known = all_runs(runs)
     if text == "latest" and known:
         return max(known, key=lambda run: run.name).resolve()
-    # A path before a name: a user who stands in another folder of runs means what lies there.
+    # Paths come before names: a user within another folder of runs means the runs there.
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()

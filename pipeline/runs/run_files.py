@@ -40,7 +40,7 @@ def lay_out(graph: Graph, view: RunView, made: Made) -> None:
             if graph.cut is None or _is_wanted(output, view, graph):
                 graph.flow(_make(graph, view, module, output, made))
     if graph.cut is not None:
-        # Once it is known what the files need: the facts are those of what is there then.
+        # Laid out last, when all tasks of the files are known: its facts cover these.
         graph.last = lambda: graph.flow(_make(graph, view, summary, *summary.OUTPUTS, made))
 
 
@@ -59,7 +59,7 @@ def plan(graph: Graph, view: RunView) -> None:
 
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
-    # what was laid out last is there last: looked at first, it spares looking at all others
+    # Tasks laid out last end last: if one of them is not there, the others need not be looked at.
     read = handles(output, view)[::-1]
     if graph.cut is not None and output.name not in view.only:
         read = [handle for handle in read if handle.index in graph.asked]

@@ -248,7 +248,7 @@ def _open(name: str | Sequence, options: Options, verb: str, place: str, warn: C
     text = header + configuration.to_toml(config, sequence.parameters)
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
-    # After the layout, which refuses what does not fit: then no folder is left behind.
+    # After the layout: if it refuses something, no folder is left behind.
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     atomic.write(folder / "config.toml", text)
     view = RunView(
@@ -305,7 +305,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
         text = f"{opened.folder} was removed while the run was under way"
         raise RilleError("RIL-740", text, remedy="run again: what was computed is in the cache")
     if made["facts"].ref is None:
-        # Without them there is no report, and what kept them from being made is the failure.
+        # Without facts there is no report: the run fails with the error that kept them from being computed.
         result.check()
     tasks = run_files.task_rows(opened.graph, result.failures)
     whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)

@@ -1,8 +1,8 @@
-"""The rig that all later stages compute with, and nothing else of what stage ``rig`` has to say.
+"""The rig that all later stages compute with, without the other facts of stage ``rig``.
 
-Stage ``rig`` also tells how sure it is and what each pair contributed, which changes with every pair that is added.
-What is computed with the rig must not: here only the rig itself passes on, so that as long as it stays the same to the
-bit, everything behind it stays cached.
+Stage ``rig`` also states how certain the rig is and what each pair contributed; these facts change with every pair that
+is added. Later stages read the rig alone, so their results stay cached as long as the rig itself is the same to the
+bit.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Matches of one stereo pair for its relative orientation (paper, section 5.2.2), and how well they fit the given rig.
 
-Dense matches are thinned, for neighbours share their windows and so their errors; the thinned ones go on to the stage
-``rig``, which decides for the sequence. A rig whose right camera may turn tells outliers, and what of the residuals no
-turn removes.
+Dense matches are thinned, because neighbours share their windows and so their errors. Stage ``rig`` reads the thinned
+matches of all pairs. Here a rig whose right camera may turn is fitted to those of one pair: it shows outliers, and the
+residual that no rotation removes.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def orientation_stage(params: OrientationParams, disparity: Bundle, *, rig: Rig,
     left, right = thin(
         disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
     )
-    # what the stage rig will read, to the last bit
+    # rounded to float32, as stage rig will read them
     points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
     matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     weight, facts = orient(rig, matches)

@@ -169,7 +169,7 @@ class _Chooser:
 
     def decision(self) -> Decision:
         chosen: list[int] = []
-        for _ in range(ROUNDS):  # what came first may be explained by what came later, and the other way round
+        for _ in range(ROUNDS):  # a later parameter may make an earlier one unnecessary, and the other way round
             before = sorted(chosen)
             self._add(chosen, range(ANGLES))
             self._add(chosen, range(ANGLES, RIG))
@@ -180,7 +180,7 @@ class _Chooser:
             if sorted(chosen) == before:
                 break
         fit, correction = self._settled(chosen)
-        if chosen and not self._worth(correction):  # what was asked for singly may come to nothing together
+        if chosen and not self._worth(correction):  # changes that were worth it singly may cancel each other
             chosen = []
             fit, correction = self._settled(chosen)
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))

@@ -1,4 +1,4 @@
-"""Robust adjustment of a rig to correspondences of one or several pairs, with what no rig explains beside it.
+"""Robust adjustment of a rig to correspondences of one or several pairs, together with errors that no rig explains.
 
 Beside the five parameters of the rig (:mod:`rille.stages.geometry.epipolar`) the images hold errors that no number of
 matches averages out, and a fit without them claims a precision it does not have. They are estimated with a prior and
@@ -172,7 +172,7 @@ def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Prior
         prior[i, i] = held[i] ** -2.0
     solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
     inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])
-    # Change of the estimate by a change of what was not estimated: the consider covariance's gain.
+    # Gain of the consider covariance: change of the estimate with each parameter that was not estimated.
     gain = -inverse @ fit.normal[np.ix_(solved, ~solved)]
     covariance = np.zeros((SIZE, SIZE))
     covariance[np.ix_(solved, solved)] = inverse + gain @ np.diag(1.0 / np.diag(prior)[~solved]) @ gain.T
@@ -183,7 +183,7 @@ def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> Orientation
     """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
     for _ in range(MAX_ITERATIONS):
-        # All pairs are linearised about the same x, so the first tells.
+        # All pairs are linearised about the same x: look at the first.
         if np.abs(x - linear[0].about)[:RIG].max() > MAX_LINEAR_STEP_RAD:
             linear = linearised(rig, pairs, x)
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]

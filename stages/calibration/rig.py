@@ -202,7 +202,7 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
-    # The offset tells already of the angle that makes it.
+    # The offset already states the angle that causes it.
     if standing(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:

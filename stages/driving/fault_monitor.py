@@ -5,8 +5,8 @@
     lost          fewer landmarks are followed than a pose needs
     slip          the way by the wheels and the way by vision differ by more than their errors explain
 
-An image is judged by itself and those before it alone, as on the vehicle: the first one that is beyond a threshold is
-where the vehicle has stopped.
+An image is judged by itself and the images before it, as on the vehicle, which stops at the first image that exceeds a
+threshold.
 """
 
 from __future__ import annotations

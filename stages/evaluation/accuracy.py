@@ -61,8 +61,7 @@ def trajectory_accuracy(
     judged, figures = np.flatnonzero(has_pose & has_truth), counts(has_pose, has_truth)
     aligned = np.full_like(truth, np.nan)
     if len(judged):
-        # By the first frame that has both: a run is judged by what grows from its own start, not by where the truth's
-        # origin lies.
+        # Aligned at the first frame that has both: drift grows from the run's own start, wherever the truth's origin.
         start = judged[0]
         aligned = rigid.compose(estimate[start], rigid.compose(rigid.inverse(truth[start]), truth))
     if len(judged) > 1:

@@ -1,10 +1,10 @@
-"""Whether truth would fit the trajectory if its file were read by another convention; truth alone is doubted here.
+"""Whether truth would fit the trajectory if its file were read by another convention; no estimate is changed by this.
 
 A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
 axis), by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24 that exchange axes
 or the one that fits best. Readings are compared by what the best rotation and translation of the world leaves of
-positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the trajectory.
-A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
+positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the trajectory. A drive
+that is straight or hardly turns is fitted by several readings alike: they are named together.
 """
 
 from __future__ import annotations

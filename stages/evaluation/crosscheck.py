@@ -200,7 +200,7 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     # With more threads the order of sums, and so the result, differs from run to run.
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-    # The calibration is given to both: refined here, it would hide what it does to our trajectory.
+    # Rille uses the same calibration: if COLMAP refined it, an error of it would look like an error of our trajectory.
     options.ba_refine_focal_length = options.ba_refine_principal_point = False
     options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
@@ -251,8 +251,8 @@ def crosscheck_stage(
         models = _models(database, {left: _near(rig, *points) for left, points in stereo.items()})
     poses, reprojection, reason = np.full((len(frames), 3, 4), np.nan), None, ""
     if models:
-        # Models of one window do not share a frame of reference; what the others hold is left to the neighbouring
-        # windows.
+        # Models of one window do not share a frame of reference: the largest is taken. Neighbouring windows may pose
+        # the frames of the others.
         best = max(models, key=lambda m: m.num_reg_frames())
         poses, reprojection = _read(best, len(frames)), float(best.compute_mean_reprojection_error())
     elif verified:

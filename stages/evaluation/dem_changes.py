@@ -1,11 +1,10 @@
 """What has changed between two elevation models of one place: where, by how much, and with which certainty.
 
-The standard deviation of a difference is that of both models, and what a remaining shift by a part of a cell makes on a
-slope; all of it is scaled up where most differences spread more, since most of the ground has not changed. A
-change is a patch of cells that differ one way by twice that, one of them at least by :data:`SURE` times. Its volume is
-that of the patch and of the cells about it, where it runs out; it has the errors of all of them, of which neighbours
-share a part: as large a part as they do where nothing has changed. It is at least :data:`SURE_VOLUME` times its
-standard deviation.
+The standard deviation s of a difference joins those of both models and the effect of a remaining shift by a part of a
+cell on a slope. It is scaled up if most differences spread more, since most of the ground has not changed. A change is
+a patch of cells that differ in one direction by 2 s, one of them at least by :data:`SURE` s. Its volume is summed over
+the patch and the cells around it. The standard deviation of the volume takes the correlation of neighbouring errors
+from ground that has not changed; a change whose volume is less than :data:`SURE_VOLUME` times that is not listed.
 """
 
 from __future__ import annotations
@@ -62,12 +61,12 @@ def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float)
     slope : (rows, cols) metres a metre.
     cell : metres.
     """
-    # What no model tells: with nothing of it, flat cells would have no error at all.
+    # Where no model states a standard deviation take the spread of the differences: else flat cells had none.
     known = np.where(np.isfinite(sigma) & (sigma > 0), sigma, mad_sigma(error[np.isfinite(error)]))
     expected = np.hypot(known, SHIFT_CELLS * cell * np.nan_to_num(slope))
     usable = np.isfinite(error) & (expected > 0)
     ratio = error[usable] / expected[usable]
-    # Two models may have errors in common; what they state is not undercut for that.
+    # Errors that two models share cancel in the difference; the stated standard deviations are never reduced for that.
     return np.asarray(expected * max(mad_sigma(ratio) if ratio.size else 1.0, 1.0))
 
 

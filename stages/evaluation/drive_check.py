@@ -1,11 +1,10 @@
 """A drive against the truth: how the wheels truly stood, how far the position was off, how long the way was.
 
 Each placement of the simulation (a few millimetres apart), however the drive ended, is judged against the vehicle's
-limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. What a drive that
-failed did not come to know, its positions or a way, is left out. Positions are compared after making the first
-pose equal, as everywhere (:mod:`rille.stages.evaluation.accuracy`). The shortest way is the planner's on the exact
-elevations; where its margin, which is for what a vehicle does not know, closes every one, it is that within the limits
-alone.
+limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. Positions or paths
+that a failed drive does not have are left out. Positions are compared after making the first pose equal, as everywhere
+(:mod:`rille.stages.evaluation.accuracy`). The shortest way is the planner's on the exact elevations; where its margin,
+which is for what a vehicle does not know, closes every one, it is that within the limits alone.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Whether an IMU contradicts the images: rates against the camera's rotations, gravity against ground that is seen.
 
-The sensor's rotation from frame to frame is that of the images in other axes: a signed exchange S of its axes, and the
-factor of degrees, are sought by which they agree. A camera at rest shows gravity alone, and that only where the ground
-is seen: several S then fit, and gravity along an axis tells nothing of the other two.
+The sensor's rotation from frame to frame should be that of the images. If it is not, a signed exchange S of its axes,
+or the factor from degrees, is sought by which they agree. At rest only gravity can be compared, and only if the images
+show the ground: several S then fit, because gravity along one axis says nothing of the other two.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
         return []
-    # A camera that hardly turns is fitted by all axes alike: those that are given come first.
+    # If the camera hardly turns all axes fit alike: then the stated ones are preferred.
     given = [0.1 * off[0] * (S is signed_axes()[0]) for _, S in readings]
     best = int(np.argmin(np.subtract(off, given)))
     factor, S = readings[best]

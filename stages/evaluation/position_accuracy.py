@@ -210,7 +210,7 @@ def fit_lever_arm(poses: Floats, truth: Floats, upright: bool, moments: Floats |
         way = np.gradient(P, axis=0) / np.maximum(np.gradient(moments[both]), 1e-9)[:, None]
     for _ in range(20):
         moved = fit_rigid(P + R @ arm, truth[both], upright).moved
-        # A shift of the truth takes the mean, its turns about one or three axes and its clock what looks like them.
+        # The fit of shift, turns and clock absorbs the part of an arm's swings that looks like them: project it out.
         centred = np.pad(moved - moved.mean(axis=0), ((0, 0), (0, 3 - width)))
         axes = np.eye(3)[2 if upright or width == 2 else 0 :]
         turns = np.stack([*(np.cross(axis, centred) for axis in axes), way - way.mean(axis=0)], axis=2)

@@ -1,4 +1,4 @@
-"""Scale of the right image of a pair against the left one: how many of its pixels one of the left image stands for.
+"""Scale of the right image of a pair against the left one: pixels of the right image for each pixel of the left one.
 
 Two cameras may have pixels or lenses of unlike size; so may the images that are given, without any calibration.
 """

@@ -1,5 +1,4 @@
-"""The coarse levels of a pair: disparities known beforehand, both images made alike, in brightness and by a plane or
-keypoints, and matched.
+"""Coarse levels of a pair: prior disparities, correction of brightness, alignment by a plane or keypoints, matching.
 
 Known disparities replace those of the coarse levels at the level on which pre-alignment is decided (2), so that they
 serve that decision too, and are refined from there on like any other match. A search of one pixel at each level below
@@ -310,7 +309,7 @@ def known(coarse: Coarse) -> Coarse:
     """Disparities known beforehand in the place of those found."""
     prior, h = coarse.prior, coarse.alignment
     if prior is not None and h is not None:
-        # Ends that come to lie near the horizon of the plane are led farther than the given ones.
+        # Points near the horizon of the plane get displacements greater than the prior's.
         prior = _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
     return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
@@ -331,10 +330,10 @@ def turn(coarse: Coarse) -> Coarse:
     h = plane.find_turn(left, given) if few and coarse.prior is None else None
     if h is None:
         return coarse
-    # Of images turned against each other the brightness tells nothing before they are upright.
+    # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
     turned = upright.anew(alignment=h)
-    # Keypoints stand on what sticks out; the matches that they made possible say more of the plane.
+    # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
     h = plane.refitted(sample(turned.images, turned.state), COARSE_LEVEL, left.shapes, h)
     again = turned if h is None else upright.anew(alignment=h)
     return max(coarse, turned, again, key=lambda tried: tried.share)

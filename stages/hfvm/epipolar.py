@@ -91,7 +91,7 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     spread = math.inf
 
     def weigh(residual: AnyArray) -> AnyArray:
-        # Start as wide as the matches scatter about the prior, and narrow to what an integer match deserves.
+        # Start with the matches' scatter about the prior, and narrow to the error of an integer match.
         nonlocal spread
         middle, first = typical(residual), math.isinf(spread)
         spread = max(sigma, 2.0 * middle if first else min(0.5 * spread, 1.5 * middle + sigma))

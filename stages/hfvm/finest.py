@@ -308,7 +308,7 @@ def complete(
         region[(valid == 0) | keep] = 0
         u, v = np.where(region != 0, plane_u, u), np.where(region != 0, plane_v, v)
         on_plane = region > 0
-        # What was found about another displacement does not apply.
+        # Error, distance and validity of the former displacement do not apply.
         error[on_plane], distance[on_plane], validity[on_plane] = FAILED_PX, -1.0, 0
     beside, matches = region < 0, keep | on_plane
     # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.

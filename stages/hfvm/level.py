@@ -1,7 +1,8 @@
-"""One level of the matcher (paper, 4.3.4): both images onto each other, what is consistent, and the epipolar band.
+"""One level of the matcher (paper, 4.3.4): each image matched to the other, the check of both, and the epipolar band.
 
-A level is a list of steps, each of which improves displacements: search, propagation, paths, median, depth edges. What
-is not consistent is interpolated along its row and handed down."""
+A level is a list of steps, each of which improves displacements: search, propagation, paths, median, depth edges.
+Displacements that fail the check are interpolated along their row for the next finer level.
+"""
 
 from __future__ import annotations
 
@@ -247,7 +248,7 @@ def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[
     brows, bcols = np.uint64(other_valid.shape[0]), np.uint64(other_valid.shape[1])
     for y in range(rows):
         for x in range(cols):
-            # Unsigned: what is negative lies beyond every column.
+            # Unsigned: a negative index becomes greater than any column.
             i, j = np.uint64(x + np.int64(own.u[y, x])), np.uint64(y + np.int64(own.v[y, x]))
             if own_valid[y, x] and i < bcols and j < brows and other_valid[j, i]:
                 du, dv = np.int64(own.u[y, x]) + other.u[j, i], np.int64(own.v[y, x]) + other.v[j, i]
@@ -274,7 +275,7 @@ def hand_down(state: State, params: HfvmParams) -> Map:
     # While the sign is unknown, the usual rig's stands.
     sign, filled = state.near_sign or -1.0, np.zeros(u.shape, np.uint8)
     fill_rows(u, v, state.left_ok, params.fill_reach, sign, filled)
-    # Rows may have nothing to take from, as at the border of what both cameras see: chance predicts nothing.
+    # A row may hold no match, as at the border of the common view: its columns are filled from other rows.
     fill_rows(u.T, v.T, (state.left_ok | (filled != 0)).T, params.fill_reach, sign, filled.T)
     # Interpolated values are fractions; a search centre is a whole pixel.
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))

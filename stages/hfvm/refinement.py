@@ -380,8 +380,7 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
     planes = _warped(images, u, v, keep)
     known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
-    # The first mean is of equal weights; what lies across an edge then counts for little, but one weighting does not
-    # yet tell it apart.
+    # The first mean has equal weights; the next ones give pixels across an edge little weight. One round is too few.
     for _ in range(3):
         # Windows with less than a tenth of a pixel's weight have no pixel that takes part.
         mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), 0.1)

@@ -1,4 +1,4 @@
-"""Matches of textureless regions, such as walls: what no window tells, a whole region does.
+"""Matches of textureless regions, such as walls, by planes on which wide windows of a whole region agree.
 
 Where an image shows next to nothing, a pixel's own match is chance. Distances of features, summed over a wide window,
 are least at the right displacement more often than at any other. So at level 1, in each large region without matches

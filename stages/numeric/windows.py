@@ -47,7 +47,8 @@ def _box(values: NDArray, depth: int, n: int) -> Any:
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
     known = ~np.isnan(a)
-    middle = a[known].mean(dtype=np.float64) if known.any() else 0.0  # sums of what is left round less
+    # Subtracted before summing: smaller sums have smaller rounding errors.
+    middle = a[known].mean(dtype=np.float64) if known.any() else 0.0
     total, count = window_sum(np.where(known, a - middle, 0.0), n), window_sum(known, n)
     mean = np.full(a.shape, np.nan, dtype=np.float32)
     np.divide(total, count, out=total, where=count > 0)

@@ -91,8 +91,7 @@ def align(
         live, at, affinity = live[inside], at[inside], affinity[inside]
         off = _levelled(grey[inside], contrast[live]) - template[live]
         right = descent[live] @ off[:, :, None]
-        # Added, not subtracted: a step is composed inversely, so what the affinity has too much counts like a grey
-        # difference.
+        # Added, not subtracted: a step is composed inversely, so excess affinity counts like a grey difference.
         right[:, 2:6] += ridge * (unexpected[live] @ affinity - np.eye(2)).reshape(-1, 4, 1)
         step = inverse[live] @ right
         affinity = affinity @ np.linalg.inv(np.eye(2) + step[:, 2:6].reshape(-1, 2, 2))

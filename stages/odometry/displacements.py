@@ -1,5 +1,4 @@
-"""Coarse displacements between two frames, what they are at given points, and the affinities that they show; windows of
-images about points."""
+"""Coarse displacements between two frames, at points, and the affinities that they show; windows about points."""
 
 from __future__ import annotations
 

@@ -270,7 +270,7 @@ def _explained(done: Adjusted) -> bool:
     rows = int((done.graph.factors.root[doubtful & done.kept] != 0).any(2).sum())
     if not rows:
         return not doubtful.any()
-    # The chain alone has as many unknowns as equations: what is beyond them are the doubtful factors.
+    # The chain alone has as many unknowns as equations, so the doubtful factors are the degrees of freedom.
     squares = 2.0 * done.graph.normal(done.state).cost
     return bool(done.kept[doubtful].mean() >= MAJORITY and squares <= scipy.special.chdtri(rows, 0.01))
 

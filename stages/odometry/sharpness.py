@@ -1,7 +1,7 @@
 """Frames of unequal sharpness: lost points are aligned once more, with the sharper image blurred like the other.
 
-A template of a sharp frame has steeper edges than a blurred one shows: the alignment does not converge, or steps too
-far on its way back. How much sharper an image is, its gradients tell where both show the same points.
+A template of a sharp frame has steeper edges than a blurred frame, so its alignment does not converge, or fails the
+check there and back. The ratio of the gradients at points that both frames show says how much sharper one of them is.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Steps between successive frames, in tables of about a hundred, and what two frames some steps apart have in common.
+"""Steps between successive frames, in tables of about a hundred, and the share of the view of frames some steps apart.
 
 The choice of basic pairs and the screening of frames go through the whole sequence. They need blocks of each motion's
 displacements, not the maps: read from tables, a sequence of thousands of frames is some tens of artifacts.

@@ -1,4 +1,4 @@
-"""What a stereo pair tells of each pixel, in the geometry of its left camera: place, range, normal, roughness.
+"""Place, range, normal and roughness of each pixel of a stereo pair, in the geometry of its left camera.
 
 A plane n . X = 1 seen along the ray m of a pixel has the inverse depth
 

@@ -1,8 +1,8 @@
-"""Reference plane of a stereo pair, straight from the disparity, and what of it the pair can reconstruct.
+"""Reference plane of a stereo pair, straight from the disparity, and the part of it that the pair can reconstruct.
 
-The inverse depth 1/Z of a plane n . X = -h (camera frame, n up, h the camera's height above it) is linear in the ray
-r = (x, y, 1): 1/Z = theta . r with theta = -n / h. And the error of 1/Z is the disparity's, the same near and far. So
-the plane is a linear fit with uniform noise ("v-disparity" and its kin, Labayrade et al. 2002,
+The inverse depth 1/Z of a plane n . X = -h (camera frame, n up, h the camera's height above it) is linear in the ray r
+= (x, y, 1): 1/Z = theta . r with theta = -n / h. And the error of 1/Z is the disparity's, the same near and far. So the
+plane is a linear fit with uniform noise ("v-disparity" and its kin, Labayrade et al. 2002,
 doi:10.1109/IVS.2002.1188024), for any rig: the inverse depth comes from the projection on the local epipolar line.
 
 Any plane of the scene is fitted alike: which one is the ground, its normal says.

@@ -254,7 +254,7 @@ def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, sigma_disparit
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
     """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
     # Where nothing is seen at all, 20 baselines stand for the distance.
-    # A twentieth may be nearer than what counts as nearest: gross mismatches.
+    # A twentieth of the points may be nearer than the nearest distance: gross mismatches.
     near = 1.0 / float(np.quantile(rho, 0.95)) if rho.size else 20.0 * rig.baseline
     return rounded_cell(2.0 * near / coarser_focal(rig))
 

@@ -200,7 +200,7 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
             remedy="give a finer map, another start, or a model of more ground",
         )
     placed = _placed(best, blocks, math.radians(params.sigma_tilt_deg))
-    # Where all of the best starts lead to one place, what is worse than they are is no rival.
+    # If all of the best starts lead to one place there is no rival: other starts fit worse.
     rivals = [fit for fit in fits if max(apart(fit, *from_above(best.pose))) > near]
     return _against(placed, best, min(rivals, key=lambda fit: fit.square)) if rivals else placed
 

@@ -5,8 +5,8 @@ axes, which come from the poses (or the rig); and noise, which comes from the ma
 models' own standard deviations let expect. The factor between both models' grey values is a by-product
 (:mod:`rille.stages.terrain.radiometry`).
 
-Of large overlaps each so many-th cell is read. The plane is a robust one through all of these, which rocks that one
-model lacks do not pull.
+Large overlaps are thinned to every n-th cell. Bias and tilt are those of a robust plane through the differences, which
+rocks that one model lacks do not pull.
 """
 
 from __future__ import annotations

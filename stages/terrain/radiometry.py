@@ -52,7 +52,7 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     values = np.column_stack([np.tile([-1.0, 1.0], (len(ordered), 1)), -moved]).ravel()
     design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
     wanted = -np.array([ratio for _, _, ratio in ordered])
-    # A direction in which the cameras hardly move tells no gradient: sway is not the way.
+    # A direction in which the cameras hardly move, such as sway, shows no gradient: the ridge holds it at 0.
     small = SWAY_SHARE * max(float((moved**2).sum()), 1e-9)
     ridge = diags_array(np.array([FADING_WEIGHT] * n + [small] * 2))
     solved = spsolve((design.T @ design + ridge).tocsc(), design.T @ wanted)[:n]

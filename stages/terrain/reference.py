@@ -1,6 +1,6 @@
 """Whether a run's elevations are heights above ground or distances from the scene's own plane, by what its pairs show.
 
-A plane that may be ground by its attitude is in many a scene: a floor under shelves, a table. A pair shows *ground* if
+Many scenes hold a level plane that is no ground: a floor under shelves, a table. A pair shows *ground* if
 
 - the vertical is known, and the plane is level but for :data:`MAX_TILT_DEG`; or
 - the ground is stated, or holds :data:`MIN_REFERENCE_SHARE` of the pair's matched pixels; or

@@ -58,7 +58,7 @@ def plan(
     def outputs() -> None:
         from rille.pipeline.runs import run_files  # it imports matplotlib
 
-        if graph.unfinished:  # what they would read is not all known: they belong to the tasks that follow
+        if graph.unfinished:  # not all of their inputs are known: they count among the tasks that follow
             return
         taken = (sequence, frames) if drive is None else drive.taken()
         run_files.plan(graph, RunView("", *taken, products, (), config, vehicle_source=settled.vehicle_source))

@@ -148,7 +148,7 @@ def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, A
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
     """What is different from the last run before that had this task."""
-    # The last run that had the task decides; what differs from runs before that one, its own `why` tells.
+    # Compare with the last run that had the task; differences from earlier runs are for that run's own `why`.
     for before in lookup.earlier(run):
         rows = events.read(before / lookup.LEDGER)
         other = next((r for r in rows if r["label"] == row["label"] and "key" in r), None)

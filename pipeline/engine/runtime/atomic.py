@@ -1,6 +1,6 @@
 """Files that appear whole or not at all: the one place that writes beside, flushes, and moves into place.
 
-What an interruption leaves behind is named ``.tmp-...``, which no pattern of ours matches; clearing up takes it.
+A file that an interruption leaves behind is named ``.tmp-...``: nobody reads it, and ``rille cache gc`` removes it.
 """
 
 from __future__ import annotations

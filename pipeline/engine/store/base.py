@@ -11,7 +11,7 @@ Files in the cache folder::
 
 The file of an artifact (:mod:`rille.pipeline.engine.store.archive`) is its own commit: it is on the disk as a whole
 before it gets its name, and gets it only if nobody has it (a link). Killed at any instant, a run leaves a whole
-artifact or none. Of two that commit one key the second is compared and thrown away: another digest is a
+artifact or none. If two runs commit one key, the second result is compared and dropped: another digest is a
 :class:`NonDeterministicError`. Checksums of what is read are compared at each reading, and all of them by
 :func:`rille.pipeline.engine.store.maintenance.verify`. What is damaged is set aside, counts as absent and is computed
 again.

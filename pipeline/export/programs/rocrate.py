@@ -35,7 +35,7 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     folder.mkdir()
     files = []
     for name, what, _ in catalogue.listed(run.run):
-        if what and (run.run / name).exists():  # what is not explained is no file of the run, but an export of it
+        if what and (run.run / name).exists():  # files without an explanation are exports, not files of the run
             copy = shutil.copytree if (run.run / name).is_dir() else shutil.copy2
             copy(run.run / name, folder / name)
             files += list(_files(folder, name, what))

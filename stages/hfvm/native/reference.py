@@ -236,7 +236,7 @@ def propagate(pair, field, smoothing):  # type: ignore[no-untyped-def]
                         best, cost, least = one, its_cost, total
                 shift[y, x], field.cost[y, x] = best, cost
                 if best != own and smoothing.rounds > 1:
-                    # The pixel itself as well: what lies beside its new displacement has not been tried.
+                    # The pixel itself as well: displacements beside its new one have not been tried.
                     dirty[y, max(x - 1, 0) : x + 2] = True
                     dirty[up, x] = dirty[down, x] = True
 

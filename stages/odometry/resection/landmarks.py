@@ -125,13 +125,12 @@ def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Fl
     rows, cols = validity.shape
     inside = np.asarray(((points >= 0) & (points <= [cols - 1, rows - 1])).all(1))
     p = np.where(inside[:, None], points, 0.0)
-    # A point on the pixel grid is its own neighbour: what lies beside it may be anything.
+    # A point on the pixel grid is its own neighbour, whatever the pixels beside it.
     first, last = np.floor(p).astype(np.intp), np.ceil(p).astype(np.intp)
     x4, y4 = (np.stack([first, last])[which, :, k].T for k, which in enumerate(([0, 1, 0, 1], [0, 0, 1, 1])))
     fx, fy = (p - first).T
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], -1)
-    # Bilinear by hand: scipy's would mix what is not matched into its neighbours, where here the whole point is
-    # refused.
+    # Bilinear by hand: a point with an unmatched neighbour is refused, where scipy's would mix the neighbour in.
     corners = np.stack([np.asarray(disparity[n])[y4, x4] for n in ("column_disparity", "row_disparity")], -1)
     good = inside & (is_matched(validity[y4, x4]) & np.isfinite(corners).all(-1)).all(1)
     corners = np.where(good[:, None, None], corners, 0.0).astype(np.float64)

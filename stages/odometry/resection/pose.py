@@ -1,4 +1,4 @@
-"""One frame's pose out of the trajectory: what stands on it is recomputed only where this pose has changed.
+"""One frame's pose out of the trajectory, so that results which depend on it change only if this pose does.
 
 Its covariance is without errors of the calibration where a plane gives the vertical. A wrong focal length lifts the
 camera on its way and tilts the ground that it sees alike; the world's vertical follows the ground: no height is off.

@@ -1,7 +1,7 @@
-"""Other sensors beside the camera: which of them are believed, how late their clocks are, and what is said of them.
+"""Other sensors beside the camera: which of them are used, the offsets of their clocks, and the warnings about them.
 
-What they say is in :mod:`rille.stages.odometry.resection.sensors`; a sensor that contradicts the chain, or most of
-whose factors the adjusted graph leaves out, is not used.
+Their measurements are factors (:mod:`rille.stages.odometry.resection.sensors`). A sensor that contradicts the chain, or
+most of whose factors the adjusted graph leaves out, is not used.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Sensors:
         """
         clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
         done = None
-        # Clocks first, by which what is left of the errors then tells more of the chain's.
+        # First the clocks: the remaining errors then show better by how much the chain's exceed its covariances.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
             said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
             groups = {name: factors for name, factors in said.items() if len(factors.ends)}

@@ -99,7 +99,7 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
         facts: dict[str, Any] = {"frame": frames[j], "landmarks": int(use.size), "inliers": 0, "rms_px": None}
         out.facts.append(facts)
         try:
-            # What is in doubt stays so: later frames see fewer of the landmarks that told the motions apart.
+            # A doubt holds for later frames, too: they see fewer of the landmarks that distinguished the motions.
             if doubt:
                 raise doubt
             posed = posed_by(use, j)
@@ -220,7 +220,7 @@ def resect_stage(
     key_points = tracks[:, 0].astype(np.float64)
     landmarks = landmarks_of(key_points, inputs.disparity, rig, T_local_key, params.disparity_sigma)
     if refused is not None:
-        # Of a rig that was knocked: what it measures is worth no pose.
+        # The rig was knocked: its disparities give no pose, so only the key frame keeps its tracks.
         tracks = np.where(np.arange(len(frames))[:, None] == 0, tracks, np.float32(np.nan))
     points = SegmentPoints(tracks, landmarks, rig.left, T_local_key)
     segment = resect_segment(points, frames, params)

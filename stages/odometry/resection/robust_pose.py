@@ -10,16 +10,16 @@ errors are weighted by how exactly the landmark itself is known (see :mod:`rille
 
 Covariances here are 6 x 6 of ``(dt, dtheta)`` in the destination frame: position error in metres, then the rotation
 vector ``R_true = exp(dtheta) R`` in radians. They contain the errors of the measurements and a shared error of the
-disparities. Errors of the intrinsics come with the adjustment
-(:mod:`rille.stages.odometry.resection.intrinsics`); the direction of the camera in the vehicle is in none. They have
-two parts:
+disparities. Errors of the intrinsics come with the adjustment (:mod:`rille.stages.odometry.resection.intrinsics`); the
+direction of the camera in the vehicle is in none. They have two parts:
 
-* what the residuals show: the errors found, times what they go together by (:func:`scatter_of_blocks`). It begins anew
-  with the landmarks of every segment;
-* what they do not show, and every segment *shares* (``shared``): the error common to all disparities, and what the
-  stated errors of tracks and disparities leave once those found are subtracted. An error that all landmarks of a
-  neighbourhood have (of sub-pixel interpolation, of relief under a template) bends the pose and leaves no residual; the
-  same camera makes the same over the same kind of ground, so along a chain these errors add up, and not their squares.
+* errors that the residuals show, enlarged for the correlation of neighbours (:func:`scatter_of_blocks`). They are
+  independent from segment to segment;
+* errors that the residuals do not show, and that every segment *shares* (``shared``): the error common to all
+  disparities, and the part of the stated errors of tracks and disparities that exceeds the residuals. An error that all
+  landmarks of a neighbourhood have (of sub-pixel interpolation, of relief under a template) bends the pose and leaves
+  no residual. The same camera makes it again over the same kind of ground, so along a chain these errors add up, and
+  not their squares.
 """
 
 from __future__ import annotations

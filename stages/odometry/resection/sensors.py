@@ -1,13 +1,13 @@
-"""What other sensors say of the trajectory: factors of its pose graph, and whether they contradict the camera's chain.
+"""Other sensors as factors of the trajectory's pose graph, and whether they contradict the camera's chain.
 
-Dead reckoning and attitude say how frames stand to each other, also across a gap of the chain; positions and the
-vertical say how frames stand in a *place*, a node of its own near the world, whose pose is found, too: positions are of
-a frame of their own. Beside errors of each measurement a sensor has some that all of its measurements share (scale and
-turn of dead reckoning, a constant offset of its clock), which are sources of the graph.
+Dead reckoning and attitude measure frames against each other, also across a gap of the chain. Positions and the
+vertical measure frames against a *place*, a node for the sensor's own frame, whose pose in the world is estimated, too.
+Beside the errors of single measurements a sensor has errors that all of its measurements share (scale and turn of dead
+reckoning, a constant offset of its clock), which are sources of the graph.
 
-A sensor that was mounted, timed or read otherwise than stated departs from the chain by more than errors of either. Of
-vectors a (ways or turns by the chain) and b (by the sensor), the matrix Q and the scale s are sought for which s Q b is
-nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they tell a turned mount, exchanged axes and a wrong unit.
+A sensor that was mounted, timed or read otherwise than stated departs from the chain by more than the errors of both.
+Of vectors a (ways or turns by the chain) and b (by the sensor), the matrix Q and the scale s are sought for which s Q b
+is nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they show a turned mount, exchanged axes or a wrong unit.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Standard deviation of elevations that both images refined.
+"""Standard deviation of elevations that were refined by both images.
 
-A sum of variances, each of which can be seen on the ground itself. With s the pixels of disparity a metre of elevation,
+It is a sum of variances. With s the pixels of disparity a metre of elevation,
 
     (s sigma_Z)^2 = FLOOR_PX^2 + STEP_FACTOR t^2 + REST_FACTOR r^2 / I + (SHADE_FACTOR N / g)^2
                     + (MOVE_FACTOR m)^2 + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2,
@@ -10,14 +10,14 @@ times 2 - v where the ground turns away from the left camera, v < 1.
 t: the step of Z from cell to cell (RMS of 3 x 3 cells), since a position that is wrong by a part of a cell is an
 elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
 the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the differences of
-the whole pair (robust), g: the grey value. In a shadow the gradients found are those of noise; what contrast there can
-be, brightness says. m: how far the refinement moved the cells (RMS of 5 x 5 cells): what the disparity and the ground
-disagree about, neither is sure of. u: the unknown share of 7 x 7 cells; a matching window beside hidden ground is the
-mean of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells),
-:data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where there was one direction.
+the whole pair (robust), g: the grey value. In a shadow the gradients are those of noise, so the grey value stands for
+the contrast. m: how far the refinement moved the cells (RMS of 5 x 5 cells): the difference between the elevations by
+the disparity and by the images. u: the unknown share of 7 x 7 cells; a matching window beside hidden ground is the mean
+of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX`
+where none of them has both; 0 where there was one direction.
 
-v: the area of the image that the slope of 5 x 5 cells takes over what level ground there would; 0 is seen edge-on, less
-cannot be seen. A window lies over more of such ground, and over what it hides.
+v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen.
+Where v is small a matching window covers more ground, some of which hides other ground.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both
 directions, preset ``accurate``, seeds 2 and 3, 22 November 2026), rounded; HOLE_VARIANCE_PX2, without which cells of

@@ -104,7 +104,7 @@ def _look(xs, ys, zs, cell, views, out):  # type: ignore[no-untyped-def]
                 _motion(P_right, at_right, 2),
             )
             right[r, c], right_slope[r, c] = grey, gx * up[0] + gy * up[1]
-            # Along the left ray the left image stays: what the right one moves by is disparity.
+            # Along the left ray the left projection stays: the motion of the right one is disparity.
             dx, dy = (x - centre[0]) / below, (y - centre[1]) / below
             scale[r, c] = math.hypot(dx * across[0] + dy * along[0] + up[0], dx * across[1] + dy * along[1] + up[1])
 

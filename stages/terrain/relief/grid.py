@@ -68,8 +68,8 @@ class Grid:
         index = np.moveaxis(self.index(xy), -1, 0)
         nearest = np.rint(index)
         index = np.where(np.abs(index - nearest) < 1e-6, nearest, index)  # the same cells: the same values
-        # Interpolating the mask beside the values tells where an unknown cell had a part; NaN itself would also spoil
-        # points whose weight for it is 0.
+        # The mask is interpolated like the values: its share shows where an unknown cell took part. NaN would spoil
+        # points, too, that give the unknown cell the weight 0.
         parts = self._parts if values is None else _parts(values)
         share, z = (scipy.ndimage.map_coordinates(a, index, order=1, mode="constant", cval=0.0) for a in parts)
         return np.where(share > 1.0 - 1e-9, z, np.nan)
