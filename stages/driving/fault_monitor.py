@@ -12,7 +12,7 @@ threshold.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -60,7 +60,7 @@ class Readings(NamedTuple):
 def judge(
     readings: Readings,
     poses: Floats,
-    inliers: list[int],
+    tracked: Sequence[Mapping[str, Any]],
     T_vehicle_left: RigidTransform,
     vehicle: Mapping[str, Any],
 ) -> Verdict:
@@ -70,7 +70,7 @@ def judge(
     ----------
     readings : of the sensors at each frame.
     poses : (frame, 3, 4) T_local_left by vision.
-    inliers : landmarks of each pose.
+    tracked : facts of each pose: the number of its ``inliers``, and why it is ``lost`` where it is.
     vehicle : its ``max_slope_deg`` and ``wheel_base``.
     """
     # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
@@ -93,10 +93,10 @@ def judge(
             return Verdict(
                 k, "acceleration", f"peak of {readings.acceleration[k]:.1f} m/s2 by the accelerometer, {limit}"
             )
-        agree = inliers[k] if there[0] and there[k] else 0
+        agree = int(tracked[k]["inliers"]) if there[0] and there[k] else 0
         if agree < MIN_LANDMARKS:
             few = f"{agree} landmarks agree with the pose, {MIN_LANDMARKS} are needed"
-            return Verdict(k, "lost", f"tracking is lost: {few}")
+            return Verdict(k, "lost", f"tracking is lost: {tracked[k].get('lost', few)}")
         moved = key.inverse() @ (RigidTransform.from_matrix(poses[k]) @ T_vehicle_left.inverse())
         contradiction = _disagreement(readings.odometry[k], moved, float(vehicle["wheel_base"]))
         if contradiction:
@@ -137,7 +137,7 @@ def fault_monitor_stage(
     verdict = judge(
         Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], wheels - wheels[0]),
         np.asarray(resect["poses"]),
-        [int(f["inliers"]) for f in resect.meta["per_frame"]],
+        resect.meta["per_frame"],
         T_vehicle_left,
         vehicle,
     )

@@ -32,14 +32,14 @@ def leg(n: int = 5, slip: float = 0.05, turn: float = 0.0) -> dict[str, Any]:
         "acceleration": np.full(n, 0.1),
         "odometry": odometry,
         "poses": np.array(poses),
-        "inliers": [99] * n,
+        "tracked": [{"inliers": 99}] * n,
     }
 
 
 def judged(**changes: Any) -> Verdict:
     given = leg() | changes
     readings = Readings(given["up"], given["acceleration"], given["odometry"])
-    return judge(readings, given["poses"], given["inliers"], T_VEHICLE_LEFT, VEHICLE)
+    return judge(readings, given["poses"], given["tracked"], T_VEHICLE_LEFT, VEHICLE)
 
 
 def test_a_leg_in_order_is_driven_to_its_end() -> None:
@@ -79,9 +79,12 @@ def test_a_bump_stops() -> None:
 
 
 def test_too_few_landmarks_stop() -> None:
-    found = judged(inliers=[99, 50, 11, 50, 50])
+    tracked = [{"inliers": n} for n in (99, 50, 11, 50, 50)]
+    found = judged(tracked=tracked)
     assert (found.stop, found.kind) == (2, "lost")
     assert "11 landmarks" in found.reason
+    tracked[2] = {"inliers": 0, "lost": "8 landmarks leave the position uncertain by 0.008 m"}
+    assert judged(tracked=tracked).reason == "tracking is lost: 8 landmarks leave the position uncertain by 0.008 m"
 
 
 @pytest.mark.parametrize(("slip", "stop"), [(0.05, None), (0.15, None), (0.3, 2), (-0.3, 2)])
