@@ -123,6 +123,9 @@ def test_a_single_wrong_cell_on_fine_ground_is_no_rock_but_a_coarse_post_is() ->
     for cell in (FINE, 0.003):  # five of which are a wheel's radius
         assert (judge(z, cell)["risk"] == HAZARDOUS).sum() == 0
     z[50, 60] = 0.5
+    # Five cells of 0.07 m are 0.35 m but for their rounding.
+    large = DEFAULT_VEHICLE.model_copy(update={"wheel_diameter": 0.7})
+    assert (judge(z, cell=0.07, vehicle=large)["risk"] == HAZARDOUS).sum() == 0
     assert (judge(z, cell=0.1, vehicle=DEFAULT_VEHICLE)["risk"] == HAZARDOUS).sum() >= 9
 
 
