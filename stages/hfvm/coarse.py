@@ -265,11 +265,6 @@ class Coarse:
         told = textured(self.images.left.layers[self.state.level], self.images.params)
         return float(np.mean(self.state.left_ok[told])) if told.any() else 0.0
 
-    @property
-    def upright(self) -> bool:
-        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
-        return not epipolar.along_rows(self.state.band.f, self.images.left.shapes[0])
-
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""
         return replace(self, images=replace(self.images, threads=threads))
