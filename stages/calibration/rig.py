@@ -43,6 +43,7 @@ from rille.stages.facts.calibration import OrientationFacts, RigFacts
 from rille.stages.geometry.epipolar import (
     MAX_IMAGE_TURN_DEG,
     NAMES,
+    angle_along,
     corrected,
     distances,
     exchanged,
@@ -102,8 +103,9 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     }
     usable = [m for m in pairs if len(m.left) >= MIN_MATCHES]
     if usable:
-        yaw_shown = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
-        facts |= cast(RigFacts, _judged(given, _share(usable), params, yaw_shown=yaw_shown))
+        turned = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
+        shown = angle_along(given) if turned else ""
+        facts |= cast(RigFacts, _judged(given, _share(usable), params, shown))
         if len(usable) < len(pairs):
             few = len(pairs) - len(usable)
             facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
@@ -114,8 +116,8 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     return facts
 
 
-def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown: bool) -> dict[str, Any]:
-    """What the pairs say on the given rig, and the rig that follows; ``yaw_shown``: its yaw is that of the tracks."""
+def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows; ``shown``: its angle that tracks tell."""
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
@@ -142,7 +144,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
     kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
-    hidden = [p for p in decision.parameters if not (p.observed or (yaw_shown and p.name == "yaw"))]
+    hidden = [p for p in decision.parameters if not (p.observed or p.name == shown)]
     warnings = _contradiction(given, median, decision, "repaired" if applied else kept, hidden)
     if turned:
         words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"

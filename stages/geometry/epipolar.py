@@ -40,6 +40,11 @@ def standing(rig: Rig) -> bool:
     return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
 
 
+def angle_along(rig: Rig) -> str:
+    """Name of the angle that moves the right image along its epipolar lines, and so all disparities."""
+    return "pitch" if standing(rig) else "yaw"
+
+
 def corrected(rig: Rig, correction: Floats) -> Rig:
     """The rig with a correction (5,) applied; the same object for a correction of zeros.
 
