@@ -429,8 +429,9 @@ def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Endin
 
 def around(pair: Coarse, window: Window) -> Window:
     """Window that :func:`interpolate_undefined` needs the arrays of."""
-    margins = FILL_MARGIN_PX, FILL_MARGIN_PX + pair.images.params.fill_reach
-    return window.grow(*margins[:: -1 if pair.state.upright else 1], pair.images.left.shapes[0])
+    reach = pair.images.params.fill_reach
+    down, aside = (reach, 0) if pair.state.upright else (0, reach)
+    return window.grow(FILL_MARGIN_PX + down, FILL_MARGIN_PX + aside, pair.images.left.shapes[0])
 
 
 def interpolate_undefined(

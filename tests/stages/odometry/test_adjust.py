@@ -260,6 +260,20 @@ def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames
     assert shares == pytest.approx([0.1, 0.1], rel=0.15)
 
 
+def test_links_that_contradict_leave_other_pieces_joined():
+    truth, rng = ring(16), np.random.default_rng(6)
+    segments, before = run_of(truth, rng, lost={6, 12})
+    assert len(before.meta["pieces"]) == 3
+    links = [seen(truth, a, b, rng) for a, b in ((1, 10), (2, 9), (8, 14), (9, 13))]
+    links[-1]["pose"][3] += 0.15
+    out = adjusted(segments, before, *links)
+    assert out.meta["pieces"] == [[0, 11], [12, 15]]
+    assert [line for line in out.meta["warnings"] if "not joined" in line]
+    np.testing.assert_array_equal(out["poses"][12:], before["poses"][12:])
+    here = slice(0, 12)
+    assert np.nanmax(np.linalg.norm(errors({"poses": out["poses"][here]}, truth[here])[:, :3], axis=1)) < 0.05
+
+
 def test_links_that_contradict_each_other_join_no_pieces():
     truth, rng = ring(), np.random.default_rng(6)
     segments, before = run_of(truth, rng, lost={6})
