@@ -118,7 +118,7 @@ def level(
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return _on_ground(ground, R_local_left, samples, rig, params.sigma_disparity, source or GROUND_PLANE)
     except DegenerateError as error:
-        why, other_share = _explained(error, samples, ground)
+        why, other = _explained(error, samples, ground)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
@@ -138,8 +138,8 @@ def level(
         "ground_share": 0.0,
         "no_ground": str(why),
     }
-    if other_share:
-        facts["other_share"] = other_share
+    if other is not None:
+        facts["other_up"] = other.up.tolist()
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
@@ -153,22 +153,24 @@ def level(
     return facts
 
 
-def _explained(error: DegenerateError, samples: Samples, ground: GroundPlane | None) -> tuple[DegenerateError, float]:
-    """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
-    samples on another plane, 0 where none dominates."""
+def _explained(
+    error: DegenerateError, samples: Samples, ground: GroundPlane | None
+) -> tuple[DegenerateError, GroundPlane | None]:
+    """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the other plane that
+    dominates, None where none does."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
-        return error, 0.0
+        return error, None
     try:
         seen = fit_plane(samples, lambda n: np.ones(len(n), dtype=bool))
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        return DegenerateError(error.code, error.message, remedy=remedy), 0.0
+        return DegenerateError(error.code, error.message, remedy=remedy), None
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
     message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
     remedy = "if that is the ground, state it as world.up in a manifest"
-    return DegenerateError(error.code, message, remedy=remedy), seen.inliers
+    return DegenerateError(error.code, message, remedy=remedy), seen
 
 
 def _on_ground(
