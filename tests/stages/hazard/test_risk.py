@@ -164,6 +164,15 @@ def test_unknown_does_not_grow_and_what_is_near_it_is_not_called_safe() -> None:
     assert ((out["reason"] & FILLED_BIT) > 0).sum() == 9
 
 
+def test_beside_its_border_a_map_is_judged_as_beside_unknown_ground() -> None:
+    """Wheels that stand a little beyond the border still touch the ground within it."""
+    rng = np.random.default_rng(4)
+    z = np.cumsum(rng.normal(scale=0.1 * MODEL.max_step, size=(120, 112)), axis=0)
+    alone, among = judge(z), judge(np.pad(z, 40, constant_values=np.nan))
+    for name in ("risk", "reason", "slope", "tilt", "clearance", "p_hazard"):
+        np.testing.assert_array_equal(alone[name], among[name][40:-40, 40:-40], err_msg=name)
+
+
 def test_a_closed_hole_is_as_uncertain_as_its_rim_is_uneven() -> None:
     """A gap of 5 cells between level ground and a 14 mm shelf, where 15 mm are permitted.
 
