@@ -38,7 +38,6 @@ from rille.stages.calibration.relative_orientation import (
 )
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
-from rille.stages.core.errors import InputError
 from rille.stages.facts.calibration import OrientationFacts, RigFacts
 from rille.stages.geometry.epipolar import (
     MAX_IMAGE_TURN_DEG,
@@ -46,8 +45,8 @@ from rille.stages.geometry.epipolar import (
     angle_along,
     corrected,
     distances,
-    exchanged,
     image_turn,
+    refuse_impossible,
     standing,
 )
 from rille.stages.geometry.geometry import Rig
@@ -66,9 +65,6 @@ distortion or a wrong calibration; spread of one, its images may be of two momen
 
 MAX_TURN_DEG = 5.0
 """Largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a baseline."""
-
-IMPOSSIBLE_SHARE = 0.5
-"""Share of matches beyond infinity from which on no depth is believed."""
 
 
 class RigParams(RelativeParams):
@@ -89,7 +85,9 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     Raises
     ------
     InputError
-        The cameras share one projection centre, or their images are swapped.
+        The cameras share one projection centre.
+    DegenerateError
+        Left and right images are swapped, or of two scenes.
     """
     given.check()
     facts: RigFacts = {
@@ -126,19 +124,9 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > IMPOSSIBLE_SHARE and not turned:
-        if exchanged(rig, np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs]))[0]:
-            raise InputError(
-                "RIL-428",
-                f"{share:.0%} of the matches lie beyond infinity: left and right are swapped, or the baseline points "
-                "the other way",
-                remedy="exchange the left and the right images, or the sign of the baseline",
-            )
-        raise InputError(
-            "RIL-375",
-            f"{share:.0%} of the matches lie beyond infinity",
-            remedy="check that left and right are of one scene and one time, and the angles between the cameras",
-        )
+    if share > BEYOND_SHARE and not turned:
+        left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
+        refuse_impossible(rig, left, right, share)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))

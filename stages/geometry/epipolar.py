@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Floats
+from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
 from rille.stages.geometry.projection import product
 from rille.stages.geometry.scale import right_pixels
@@ -178,6 +179,26 @@ def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float
     as_given, other_way = fits(rig, left, right), fits(rig, right, left)
     # Most of the matches fit the other way, and twice as many as the given one.
     return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
+
+
+def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
+    """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig with its sides exchanged.
+
+    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines.
+    """
+    swapped, as_given, other_way = exchanged(rig, left, right)
+    if swapped:
+        raise DegenerateError(
+            "RIL-781",
+            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
+            remedy="check left/right order, they seem swapped, and the sign of the baseline",
+        )
+    if beyond > 0.5:
+        raise DegenerateError(
+            "RIL-375",
+            f"{beyond:.0%} of the matches lie beyond infinity",
+            remedy="check that left and right are of one scene and one time, and the angles between the cameras",
+        )
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:

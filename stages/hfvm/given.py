@@ -233,12 +233,10 @@ def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool
     column, row : (row, col) disparities, pixels, right minus left.
     matched : (row, col) bool, which to trust.
     """
-    indices = np.flatnonzero(matched)
-    if len(indices) < MIN_MATCHES:
+    places = sample(column, row, matched)
+    if places is None:
         return False
-    indices = indices[:: 1 + len(indices) // MAX_FIT_MATCHES]
-    y, x = np.unravel_index(indices, matched.shape)
-    u, v = (np.asarray(a).reshape(-1)[indices].astype(np.float64) for a in (column, row))
+    (x, y), (u, v) = places[0].T, (places[1] - places[0]).T
     width = matched.shape[1]
     k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
     # In units of the image width k is D in pixels for a focal length of one width.

@@ -30,7 +30,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.epipolar import exchanged, inverse_depth
+from rille.stages.geometry.epipolar import inverse_depth, refuse_impossible
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
@@ -280,25 +280,8 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
     sigma = per_pixel * sigma_disparity
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
-        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
+        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
     return Samples(rig.left.rays(pixels), rho, sigma)
-
-
-def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
-    """Parallel cameras see everything ``beyond`` infinity (share) with their sides exchanged, others on wrong lines."""
-    swapped, as_given, other_way = exchanged(rig, left, right)
-    if swapped:
-        raise DegenerateError(
-            "RIL-781",
-            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, and the sign of the baseline",
-        )
-    if beyond > 0.5:
-        raise DegenerateError(
-            "RIL-375",
-            f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="check that left and right are of one scene and one time, and the angles between the cameras",
-        )
 
 
 def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:

@@ -132,20 +132,21 @@ def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
     return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
 
 
-def corrected_rig(rig: Rig, errors: Sequence[float] | Floats, angles: Sequence[float]) -> Rig:
-    """Rig whose cameras are changed by the first of ``errors``, and whose angles by ``angles`` (5,), rad."""
-    turned = epipolar.corrected(rig, np.array(angles))
+def corrected_rig(
+    rig: Rig, errors: Sequence[float] | Floats, yaw: float, pitch: float = 0.0, others: Sequence[float] = (0.0,) * 3
+) -> Rig:
+    """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
+
+    Where one camera stands above the other, pitch and yaw change places.
+    """
+    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
+    turned = epipolar.corrected(rig, np.array([*first, *others]))
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 
 
 def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
     """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
-    return corrected_rig(rig, correction, _angles(rig, 0.0, correction[-1]))
-
-
-def _angles(rig: Rig, pitch: float, yaw: float, others: Sequence[float] = (0.0, 0.0, 0.0)) -> list[float]:
-    """Correction (5,) of the rig, rad; where one camera stands above the other, pitch and yaw change places."""
-    return [yaw, pitch, *others] if epipolar.standing(rig) else [pitch, yaw, *others]
+    return corrected_rig(rig, correction, correction[-1])
 
 
 def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Floats) -> Floats:
@@ -159,7 +160,7 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
     """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
     pitch, *others, yaw = errors[CORRECTED + 1 :]
-    other = corrected_rig(rig, errors, _angles(rig, pitch, yaw, others))
+    other = corrected_rig(rig, errors, yaw, pitch, others)
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:

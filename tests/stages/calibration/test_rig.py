@@ -213,9 +213,9 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
     assert told(alone, shown=True)[0].startswith(f"the rig moves: {NAMES[strong].replace('_', ' ')} of 1 of 5 pairs")
 
 
-def test_swapped_images_lie_beyond_infinity():
+def test_swapped_images_are_named():
     pairs = [PointPairs(m.pair, m.right, m.left) for m in street(2)]
-    with raises("RIL-428"):
+    with raises("RIL-781"):
         facts(street_rig(), pairs)
 
 
