@@ -8,6 +8,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.odometry.pose_graph import Factors, GraphState, PoseGraph, adjust, root_of
 from rille.stages.odometry.resection.adjust import adjust_stage
+from rille.stages.odometry.resection.loop import closure
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 
 STEP = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
@@ -223,6 +224,8 @@ def test_a_link_that_no_other_agrees_with_joins_no_pieces():
         out = adjusted(segments, before, *links)
         assert out.meta["pieces"] == before.meta["pieces"]
         assert len([line for line in out.meta["warnings"] if "alone link" in line]) == len(links)
+        # Between the frames of two pieces there is no distance.
+        assert closure(links[0], before, out).left_m is None
 
 
 def test_a_piece_that_nothing_joins_stays_as_it_is():
