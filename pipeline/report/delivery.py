@@ -206,9 +206,10 @@ def _reference(view: RunView) -> Items:
     reason = f"{first['why']}: " if "why" in first else ""
     why = (
         f"{reason}elevations are distances from {whose} (normal [{normal}] in the first camera's frame, "
-        f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there. If "
-        "that is the ground, state its normal as world.up in a manifest"
+        f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there"
     )
+    if "world.up" not in reason:
+        why += ". If that is the ground, state its normal as world.up in a manifest"
     return [_item("reference", "No ground, so neither hazards nor paths", why)]
 
 

@@ -38,10 +38,19 @@ from rille.stages.calibration.relative_orientation import (
 )
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
-from rille.stages.core.errors import InputError
 from rille.stages.facts.calibration import OrientationFacts, RigFacts
-from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG, NAMES, corrected, distances, image_turn, standing
+from rille.stages.geometry.epipolar import (
+    MAX_IMAGE_TURN_DEG,
+    NAMES,
+    angle_along,
+    corrected,
+    distances,
+    image_turn,
+    refuse_impossible,
+    standing,
+)
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.scale import right_pixels
 from rille.stages.numeric.robust import mad_sigma
 
 MAX_MATCHES = 10_000
@@ -51,14 +60,11 @@ MIN_MATCHES_OF_PAIR = 200
 """Matches of a pair that count at least, however many pairs there are."""
 
 BAD_ROWS_PX = 1.0
-"""Residual [pixels] after the repair from which on it is doubted: RMS of all pairs, lens distortion or a wrong
-calibration; spread of one, its images may be of two moments."""
+"""Residual [pixels of the coarser image] after the repair from which on it is doubted: RMS of all pairs, lens
+distortion or a wrong calibration; spread of one, its images may be of two moments."""
 
 MAX_TURN_DEG = 5.0
 """Largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a baseline."""
-
-SWAPPED_SHARE = 0.5
-"""Share of matches beyond infinity from which on left and right are taken to be swapped."""
 
 
 class RigParams(RelativeParams):
@@ -79,7 +85,9 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     Raises
     ------
     InputError
-        The cameras share one projection centre, or their images are swapped.
+        The cameras share one projection centre.
+    DegenerateError
+        Left and right images are swapped, or of two scenes.
     """
     given.check()
     facts: RigFacts = {
@@ -93,8 +101,9 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     }
     usable = [m for m in pairs if len(m.left) >= MIN_MATCHES]
     if usable:
-        yaw_shown = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
-        facts |= cast(RigFacts, _judged(given, _share(usable), params, yaw_shown=yaw_shown))
+        turned = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
+        shown = angle_along(given) if turned else ""
+        facts |= cast(RigFacts, _judged(given, _share(usable), params, shown))
         if len(usable) < len(pairs):
             few = len(pairs) - len(usable)
             facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
@@ -105,8 +114,8 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     return facts
 
 
-def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown: bool) -> dict[str, Any]:
-    """What the pairs say on the given rig, and the rig that follows; ``yaw_shown``: its yaw is that of the tracks."""
+def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows; ``shown``: its angle that tracks tell."""
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
@@ -115,29 +124,26 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, *, yaw_shown
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > SWAPPED_SHARE and not turned:
-        raise InputError(
-            "RIL-428",
-            f"{100 * share:.0f} % of the matches lie beyond infinity: left and right are swapped, or the baseline "
-            "points the other way",
-            remedy="exchange the left and the right images, or the sign of the baseline",
-        )
+    if share > BEYOND_SHARE and not turned:
+        left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
+        refuse_impossible(rig, left, right, share)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
     kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
-    hidden = [p for p in decision.parameters if not (p.observed or (yaw_shown and p.name == "yaw"))]
+    hidden = [p for p in decision.parameters if not (p.observed or p.name == shown)]
     warnings = _contradiction(given, median, decision, "repaired" if applied else kept, hidden)
     if turned:
         words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"
         warnings = [f"{words} against the left ones, which the calibration does not say: turn them back"]
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
-    suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > BAD_ROWS_PX]
+    bad_rows = right_pixels(given) * BAD_ROWS_PX
+    suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > bad_rows]
     marks |= {"suspects": suspects} if suspects else {}
-    warnings += [] if turned else _doubts(share, after)
+    warnings += [] if turned else _doubts(share, after, bad_rows)
     # Beside a calibration of other images the differences between pairs say nothing.
-    moves, knocked = ([], "") if far else _drift(linearised(given, pairs), per_pair, params)
+    moves, knocked = ([], "") if far else _drift(linearised(given, pairs), per_pair, params, bad_rows)
     warnings += moves
     marks |= {"knocked": knocked} if knocked else {}
     return {
@@ -240,10 +246,10 @@ def _contradiction(given: Rig, offset: float, decision: Decision, done: str, hid
     return lines
 
 
-def _doubts(share: float, residual: float) -> list[str]:
-    """Signs that something other than the rig's orientation is wrong."""
+def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
+    """Signs that something other than the rig's orientation is wrong; ``bad_rows``: see :data:`BAD_ROWS_PX`."""
     lines = []
-    if residual > BAD_ROWS_PX:
+    if residual > bad_rows:
         lines.append(
             f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
             "the wrong calibration given?"
@@ -253,10 +259,12 @@ def _doubts(share: float, residual: float) -> list[str]:
     return lines
 
 
-def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> tuple[list[str], str]:
+def _drift(
+    start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams, bad_rows: float
+) -> tuple[list[str], str]:
     """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
 
-    In words; also one line on what moves the rows most, where that is too far for any calibration, else nothing.
+    In words; also one line on what moves the rows most, where that is farther than ``bad_rows``, else nothing.
 
     Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
     how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
@@ -269,7 +277,7 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
     departure = values - usual
     moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
-    lines, knocked, most = [], "", BAD_ROWS_PX
+    lines, knocked, most = [], "", bad_rows
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
         odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)

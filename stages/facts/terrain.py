@@ -33,8 +33,8 @@ class GroundFacts(Facts):
     max_sigma: NotRequired[float]
     """Largest standard deviation, m, of elevations above a plane that is no ground."""
     no_ground: NotRequired[str]
-    other_share: NotRequired[float]
-    """Of the sampled pixels, where most lie on a plane that cannot be ground by its attitude."""
+    other_up: NotRequired[list[float]]
+    """Normal, in the left camera's frame, of a plane that most pixels lie on and that is no ground by its attitude."""
     why: NotRequired[str]
     """The reference is a plane that is no ground, though none was asked for."""
     seen_up: NotRequired[list[float]]

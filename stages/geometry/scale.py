@@ -31,6 +31,11 @@ def of_rig(rig: Rig) -> Floats:
     return np.array([effective(rig.right.fx / rig.left.fx), effective(rig.right.fy / rig.left.fy)])
 
 
+def right_pixels(rig: Rig) -> float:
+    """Right pixels that an error of one pixel of the images makes: more than 1 where the left image is the coarser."""
+    return max(1.0, float(of_rig(rig).max()))
+
+
 def axes(rig: Rig) -> Floats:
     """Where a column and a row of the left image lead in the right one, pixels: its columns (2,) and rows (2,), by the
     scale, and by how the cameras are rolled against each other."""

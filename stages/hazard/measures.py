@@ -59,7 +59,8 @@ class HazardInput:
         self, surface: Floats32, closed: Floats32, std: Floats32, cell: float, vehicle: Vehicle, window: float
     ) -> None:
         # Of coarser models a single cell may be the top of a stone.
-        self.surface = median3(surface) if MIN_FINE_CELLS * cell <= 0.5 * vehicle.wheel_diameter else surface
+        fine = MIN_FINE_CELLS * cell <= 0.5 * vehicle.wheel_diameter * (1.0 + 1e-6)
+        self.surface = median3(surface) if fine else surface
         self.closed, self.std, self.cell, self.vehicle = closed, std, cell, vehicle
         self.reach, self.near = window_reach(window, cell), window_reach(0.5 * window, cell)
         self.stride = stride(vehicle, cell)

@@ -124,17 +124,16 @@ def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: B
     """
     stance = Stance.of(vehicle, cell)
     reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
-    stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
-    ground = -running_max(-low, stance.wheel_reach)
-    patchy = [running_max((~whole).astype(np.float32), n) > 0 for n in (stance.wheel_reach, stance.belly_reach)]
-    padded = [
-        np.pad(np.where(np.isfinite(a), a, np.float32(np.nan)), reach, constant_values=np.nan)
-        for a in (stand, ground, belly)
-    ]
-    # Beyond the map all is unknown.
-    padded += [np.pad(a.astype(np.uint16), reach, constant_values=1) for a in patchy]
     out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
-    _place(_Ground(*padded), stance._replace(wheels=stance.wheels + reach, belly=stance.belly + reach), out)
+    # Beyond the map all is unknown; a wheel there may still touch ground of the map.
+    high, low = (np.pad(a, reach, constant_values=np.nan) for a in (high, low))
+    unknown = np.pad((~whole).astype(np.float32), reach, constant_values=1.0)
+    stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
+    maps = [
+        np.where(np.isfinite(a), a, np.float32(np.nan)) for a in (stand, -running_max(-low, stance.wheel_reach), belly)
+    ]
+    maps += [(running_max(unknown, n) > 0).astype(np.uint16) for n in (stance.wheel_reach, stance.belly_reach)]
+    _place(_Ground(*maps), stance._replace(wheels=stance.wheels + reach, belly=stance.belly + reach), out)
     return Places(np.sqrt(out.tilt), np.sqrt(out.slope), out.rise, out.unstood)
 
 

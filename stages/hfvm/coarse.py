@@ -84,7 +84,8 @@ def impose(images: PyramidPair, state: State, prior: PriorDisparities | None) ->
         return state
     u, v, known = _coarse(prior, state.level, state.left.u.shape)
     left = _overlay(state.left, u, v, known)
-    ru, rv, hit = _reverse(u, v, known, state.right.u.shape, state.near_sign or -1.0)
+    near = (state.near_sign or -1.0) * np.asarray(v if state.upright else u, np.float64)
+    ru, rv, hit = _reverse(u, v, known, state.right.u.shape, near)
     right = _overlay(state.right, ru, rv, hit)
     masks = [image.layers[state.level].valid != 0 for image in (images.left, images.right)]
     left_ok, right_ok = (state.left_ok | known) & masks[0], (state.right_ok | hit) & masks[1]
@@ -111,12 +112,12 @@ def _coarse(
 
 
 def _reverse(
-    u: AnyArray, v: AnyArray, known: NDArray[np.bool_], shape: tuple[int, ...], near_sign: float
+    u: AnyArray, v: AnyArray, known: NDArray[np.bool_], shape: tuple[int, ...], near: AnyArray
 ) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
-    """Displacements of the right image: each left one at its far end; of several the nearest thing's."""
+    """Displacements of the right image: each left one at its far end; of several the nearest thing's, by ``near``."""
     y, x = np.nonzero(known)
     # From far to near, since of several that meet at a pixel the last one stays: the one that hides the others.
-    order = np.argsort(near_sign * u[y, x].astype(np.float64), kind="stable")
+    order = np.argsort(near[y, x], kind="stable")
     y, x = y[order], x[order]
     xr, yr = x + u[y, x].astype(np.intp), y + v[y, x].astype(np.intp)
     inside = (xr >= 0) & (xr < shape[1]) & (yr >= 0) & (yr < shape[0])
@@ -263,11 +264,6 @@ class Coarse:
         """Share of the left image's pixels with texture that are consistent."""
         told = textured(self.images.left.layers[self.state.level], self.images.params)
         return float(np.mean(self.state.left_ok[told])) if told.any() else 0.0
-
-    @property
-    def upright(self) -> bool:
-        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
-        return not epipolar.along_rows(self.state.band.f, self.images.left.shapes[0])
 
     def with_threads(self, threads: int) -> Coarse:
         """The same, to be matched on by so many threads."""

@@ -72,8 +72,7 @@ def fit_points(
     if spread * scale > PLAIN_SPREAD_PX:
         cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
         if cols[1] < cost:
-            swap = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-            f, spread = swap @ cols[0] @ swap, cols[2]
+            f, spread = transposed(cols[0]), cols[2]
     to_left, to_right = (
         np.array([[1 / scale, 0.0, -x / scale], [0.0, 1 / scale, -y / scale], [0, 0, 1.0]])
         for x, y in (left_mid, right_mid)
@@ -104,6 +103,11 @@ def _solve(p: AnyArray, q: AnyArray, sigma: float) -> tuple[Matrix, float, float
     return f, cost, typical(residual)
 
 
+def transposed(f: Matrix) -> Matrix:
+    """The same constraint in images whose rows and columns are exchanged."""
+    return np.asarray(f[[1, 0, 2]][:, [1, 0, 2]])
+
+
 def typical(residual: AnyArray) -> float:
     """Median magnitude (the upper one of two)."""
     size = np.abs(residual)
@@ -117,7 +121,8 @@ def finer(f: Matrix) -> Matrix:
 
 
 def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: tuple[int, ...]) -> float:
-    """Sign of the column displacement of near things against far ones: -1 on a usual rig, +1 with images swapped.
+    """Sign of the displacement along the rows of near things against far ones: -1 on a usual rig, +1 with images
+    swapped.
 
     On a convergent rig the displacement of far things is not zero; the toe-in shows in the terms ``y'x`` and ``x'y``
     (keystone), which give it for a focal length of about the image width. A vote: only the filling of gaps hangs on it.
@@ -126,9 +131,6 @@ def near_sign(f: Matrix, u: AnyArray, left_shape: tuple[int, ...], right_shape: 
     (rows, cols), (right_rows, right_cols) = left_shape, right_shape
     middles = (0.5 * (cols - 1), 0.5 * (rows - 1)), (0.5 * (right_cols - 1), 0.5 * (right_rows - 1))
     g = moved(f, *middles)
-    # Lines along the columns: column displacements do not tell near from far, and the usual sign stands.
-    if abs(g[1, 2]) < abs(g[0, 2]):
-        return -1.0
     far = -(g[1, 0] + g[0, 1]) / g[1, 2] * float(cols) ** 2 + 0.5 * (right_cols - cols)
     return -1.0 if np.median(u) <= far else 1.0
 

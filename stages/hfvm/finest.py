@@ -136,7 +136,7 @@ class FinestWork:
 
     ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
     from the one to the other, is given. ``left, back``: whole displacements of the left window in that of ``b``, and
-    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.coarse.Coarse`.
+    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.level.State`.
     """
 
     a: Layer
@@ -315,15 +315,20 @@ def complete(
     alone = lonely(matches, params.min_support)
     mark(validity, alone, Validity.SPECKLE)
     filled = (alone | beside).astype(np.uint8)
-    fill_rows(u, v, matches | beside, params.fill_reach, ending.near_sign or -1.0, filled)
+    along, across, known, done = u, v, matches | beside, filled
+    if ending.upright:
+        # Of the maps as they lie, columns are rows, and row displacements show depth.
+        along, across, known, done = v.T, u.T, known.T, done.T
+    fill_rows(along, across, known, params.fill_reach, ending.near_sign or -1.0, done)
+    if ending.f is not None:
+        f = epipolar.moved(ending.f, *2 * ((window.x0, window.y0),))
+        # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
+        across[:] = epipolar.settled(epipolar.transposed(f) if ending.upright else f, along, across, done)
     matches &= ~alone
     std = refinement.standard_deviation(results["noise"], v if ending.upright else u, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
-    filled[(valid == 0) | matches] = 0
-    if ending.f is not None:
-        # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
-        v = epipolar.settled(epipolar.moved(ending.f, *2 * ((window.x0, window.y0),)), u, v, filled)
+    filled[valid == 0] = 0
     if ending.alignment is not None:
         u, v = plane.carried(plane.to_original(ending.alignment, ending.shape), u, v, window.x0, window.y0)
         # Found in pixels of the aligned image, as displacements were.
@@ -354,7 +359,7 @@ TARGET_MARGIN_PX = 40
 """Pixels around the places in the right image that the predictions of a tile lead to: search, rounds, features."""
 
 FILL_MARGIN_PX = 16
-"""Pixels around a window that its filling and standard deviations depend on, besides the reach along rows."""
+"""Pixels around a window that its filling and standard deviations depend on, besides the reach along lines."""
 
 
 def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
@@ -367,7 +372,7 @@ def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     if state.level > 0:
         state = match_level(replace(images, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
     left, right = a.layers[0], b.layers[0]
-    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment, pair.upright)
+    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment, pair.state.upright)
     if pair.alignment is not None:
         work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
     result = subpixel(work)  # 4.3.2
@@ -419,12 +424,14 @@ def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Endin
     f, planes = None if free else fitted_lines(matches, shapes), None
     if f is not None and "planes" not in images.params.without:
         planes = textureless.find((images.left, images.right), matches, f, sign)
-    return Ending(shapes[0], sign, pair.alignment, f, planes, pair.upright)
+    return Ending(shapes[0], sign, pair.alignment, f, planes, pair.state.upright)
 
 
 def around(pair: Coarse, window: Window) -> Window:
     """Window that :func:`interpolate_undefined` needs the arrays of."""
-    return window.grow(FILL_MARGIN_PX, FILL_MARGIN_PX + pair.images.params.fill_reach, pair.images.left.shapes[0])
+    reach = pair.images.params.fill_reach
+    down, aside = (reach, 0) if pair.state.upright else (0, reach)
+    return window.grow(FILL_MARGIN_PX + down, FILL_MARGIN_PX + aside, pair.images.left.shapes[0])
 
 
 def interpolate_undefined(

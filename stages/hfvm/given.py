@@ -46,7 +46,7 @@ from rille.stages.hfvm.coarse import (
     ratio_of_matches,
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import as_matched
+from rille.stages.hfvm.image import as_matched, thinned
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
@@ -160,11 +160,10 @@ def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.b
 
 
 def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Places | None:
-    """Evenly strided matches: left and right pixels (n, 2), column and row; None where there are too few."""
-    indices = np.flatnonzero(matched)
-    if len(indices) < MIN_MATCHES:
+    """Evenly spread matches: left and right pixels (n, 2), column and row; None where there are too few."""
+    y, x = thinned(matched, MAX_FIT_MATCHES)
+    if len(y) < MIN_MATCHES:
         return None
-    y, x = np.unravel_index(_strided(indices, MAX_FIT_MATCHES), matched.shape)
     left = np.stack([x, y], 1).astype(np.float64)
     return left, left + np.stack([column[y, x], row[y, x]], 1)
 
@@ -194,7 +193,8 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     """
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
     keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
-    chosen = _strided(np.flatnonzero(keep), MAX_PATCHES)
+    chosen = np.flatnonzero(keep)
+    chosen = chosen[:: -(-len(chosen) // MAX_PATCHES) or 1]
     looks_alike = []
     for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
         patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]
@@ -215,11 +215,6 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
 
 
-def _strided(indices: AnyArray, most: int) -> AnyArray:
-    """At most so many of the given ones, evenly strided from the first to the last."""
-    return indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(np.intp)]
-
-
 def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
     last = np.array([shape[1] - 1 - margin, shape[0] - 1 - margin])
     return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
@@ -233,12 +228,10 @@ def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool
     column, row : (row, col) disparities, pixels, right minus left.
     matched : (row, col) bool, which to trust.
     """
-    indices = np.flatnonzero(matched)
-    if len(indices) < MIN_MATCHES:
+    places = sample(column, row, matched)
+    if places is None:
         return False
-    indices = indices[:: 1 + len(indices) // MAX_FIT_MATCHES]
-    y, x = np.unravel_index(indices, matched.shape)
-    u, v = (np.asarray(a).reshape(-1)[indices].astype(np.float64) for a in (column, row))
+    (x, y), (u, v) = places[0].T, (places[1] - places[0]).T
     width = matched.shape[1]
     k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
     # In units of the image width k is D in pixels for a focal length of one width.

@@ -91,7 +91,8 @@ NEAR_SIGN = -1.0
 @dataclass(frozen=True)
 class State:
     """Result of one level: both maps, which left and right pixels are consistent, band of the next finer level, and
-    sign of depth: -1 where nearer things have lesser column displacements, +1 greater, 0 unknown."""
+    sign of depth: -1 where nearer things have lesser displacements in columns, on ``upright`` lines in rows, +1
+    greater, 0 unknown."""
 
     level: int
     left: Map
@@ -100,6 +101,11 @@ class State:
     right_ok: NDArray[np.bool_]
     band: Band
     near_sign: float
+
+    @property
+    def upright(self) -> bool:
+        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
+        return not epipolar.along_rows(self.band.f, self.left.u.shape)
 
     def reverse(self) -> State:
         """The state of the reversed pair: left and right exchanged."""
@@ -216,7 +222,9 @@ def edges(look: Look, field: Field) -> Field:
     """
     wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
     pair, grey = LevelPair(look.a.compact, look.b.compact), np.rint(look.a.grey).astype(np.int16)
-    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), int(look.near_sign)), field.cost)
+    # On upright lines columns do not tell near from far.
+    sign = int(look.near_sign) if epipolar.along_rows(look.band.f, wanted.shape) else 0
+    return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), sign), field.cost)
 
 
 def match_level(images: PyramidPair, level: int, above: State | None, near_sign: float = 0.0) -> State:
@@ -229,7 +237,7 @@ def match_level(images: PyramidPair, level: int, above: State | None, near_sign:
     )
     a, b = images.left.layers[level].valid, images.right.layers[level].valid
     ok = agree(left, right, a, b, images.params.backmatch), agree(right, left, b, a, images.params.backmatch)
-    return with_band(images, State(level, left, right, *ok, FREE_BAND, known))
+    return with_band(images, State(level, left, right, *ok, FREE_BAND, known), above)
 
 
 def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
@@ -296,7 +304,7 @@ def sample(images: PyramidPair, state: State) -> Sample:
     return Sample(x, y, u[y, x], v[y, x])
 
 
-def with_band(images: PyramidPair, state: State) -> State:
+def with_band(images: PyramidPair, state: State, above: State | None) -> State:
     """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
     if images.params.band == 0 or state.level == 0:
         return state
@@ -307,9 +315,13 @@ def with_band(images: PyramidPair, state: State) -> State:
     f, spread = fit
     # Where lenses bend the lines, or the fit is poor, the band gives way.
     mu = images.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
-    # Found once, by the first level that has a band; finer ones keep it.
-    sign = state.near_sign or epipolar.near_sign(f, s.u, *shapes)
-    return replace(state, band=Band(epipolar.finer(f), mu), near_sign=sign)
+    known = replace(state, band=Band(epipolar.finer(f), mu))
+    # Found once, by the first level that has a band; finer ones keep it while lines run the same way.
+    if state.near_sign and (above is None or above.upright == known.upright):
+        return known
+    if known.upright:
+        f, s, shapes = epipolar.transposed(f), s._replace(u=s.v), (shapes[0][::-1], shapes[1][::-1])
+    return replace(known, near_sign=epipolar.near_sign(f, s.u, *shapes))
 
 
 def descend(images: PyramidPair, stop: int, above: State | None = None, near_sign: float = 0.0) -> State:

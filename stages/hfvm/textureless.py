@@ -264,13 +264,13 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
     ----------
     matches : displacements ``u, v`` (row, col) of level 0, pixels, and ``validity``, 0 where matched.
     f : fundamental matrix of level 0, see :func:`rille.stages.hfvm.epipolar.oriented`.
-    near_sign : sign of the column displacement of near things against far ones; 0 unknown.
+    near_sign : sign of the displacement along the lines of near things against far ones; 0 unknown.
     """
     left, right = (image.layers[REGION_LEVEL] for image in images)
     label, terms = np.zeros(left.shape, np.int8), list[list[float]]()
     up = plane.finer(REGION_LEVEL)
     coarse = up.T @ f @ up
-    steps = _steps(matches, f, near_sign if epipolar.along_rows(coarse, left.shape) else 0.0)
+    steps = _steps(matches, f, near_sign)
     # Of the pixels below none is matched.
     unmatched = np.ones((2 * left.shape[0], 2 * left.shape[1]), bool)
     np.not_equal(matches["validity"], 0, out=unmatched[whole(matches["validity"].shape).slices])

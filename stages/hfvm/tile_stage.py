@@ -152,7 +152,7 @@ def _final(task: Task) -> Bundle[TileFacts]:
     f, terms, planes = bundle.arrays.get("f"), bundle.meta["terms"], None
     if f is not None and terms:
         planes = textureless.Planes(bundle["region"], terms, f)
-    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes, task.pair.upright)
+    ending = Ending(shape, task.pair.state.near_sign, task.pair.alignment, f, planes, task.pair.state.upright)
     # At half the resolution with the neighbours that slopes are taken from.
     window = task.window.grow(1, 1, shape) if task.half else task.window
     arrays = finest.interpolate_undefined(task.pair, window, task.fine(finest.around(task.pair, window)), ending)

@@ -160,12 +160,11 @@ class PoseGraph:
         sources = np.arange(self.factors.shared.shape[2])
         return np.asarray(np.where(sources < self.common, self.excess**-2.0, 1.0))
 
-    def holds_together(self, kept: Bools) -> bool:
-        """Whether the factors that are kept (m,) and measure positions connect all nodes."""
+    def parts(self, kept: Bools) -> NDArray[np.int32]:
+        """Parts (n,), from 0 on, of the nodes, each connected by factors that are kept (m,) and measure positions."""
         a, b = self.factors.ends[kept & (self.factors.root[:, :, :3] != 0).any((1, 2))].T
         links = scipy.sparse.coo_array((np.ones(len(a)), (a, b)), shape=2 * (self.nodes,))
-        count, _ = scipy.sparse.csgraph.connected_components(links, directed=False)
-        return bool(count == 1)
+        return np.asarray(scipy.sparse.csgraph.connected_components(links, directed=False)[1])
 
     def errors(self, state: GraphState) -> Floats:
         """Whitened errors (m, 6) of the factors, before weights."""

@@ -30,7 +30,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX, exchanged, fits, inverse_depth
+from rille.stages.geometry.epipolar import inverse_depth, refuse_impossible
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
@@ -118,7 +118,7 @@ def level(
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return _on_ground(ground, R_local_left, samples, rig, params.sigma_disparity, source or GROUND_PLANE)
     except DegenerateError as error:
-        why, other_share = _explained(error, samples, ground)
+        why, other = _explained(error, samples, ground)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
@@ -138,8 +138,8 @@ def level(
         "ground_share": 0.0,
         "no_ground": str(why),
     }
-    if other_share:
-        facts["other_share"] = other_share
+    if other is not None:
+        facts["other_up"] = other.up.tolist()
     if known_up is not None:
         with suppress(DegenerateError):
             # The images may show ground where the given vertical has none: then one of the two is wrong.
@@ -153,22 +153,24 @@ def level(
     return facts
 
 
-def _explained(error: DegenerateError, samples: Samples, ground: GroundPlane | None) -> tuple[DegenerateError, float]:
-    """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the share of the
-    samples on another plane, 0 where none dominates."""
+def _explained(
+    error: DegenerateError, samples: Samples, ground: GroundPlane | None
+) -> tuple[DegenerateError, GroundPlane | None]:
+    """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the other plane that
+    dominates, None where none does."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
-        return error, 0.0
+        return error, None
     try:
         seen = fit_plane(samples, lambda n: np.ones(len(n), dtype=bool))
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        return DegenerateError(error.code, error.message, remedy=remedy), 0.0
+        return DegenerateError(error.code, error.message, remedy=remedy), None
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
     message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
     remedy = "if that is the ground, state it as world.up in a manifest"
-    return DegenerateError(error.code, message, remedy=remedy), seen.inliers
+    return DegenerateError(error.code, message, remedy=remedy), seen
 
 
 def _on_ground(
@@ -278,23 +280,8 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
     sigma = per_pixel * sigma_disparity
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
-        _refuse_swapped(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
+        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
     return Samples(rig.left.rays(pixels), rho, sigma)
-
-
-def _refuse_swapped(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
-    """Parallel cameras see everything ``beyond`` infinity (share) with their sides exchanged, others on wrong lines."""
-    remedy = "check left/right order, they seem swapped, and the sign of the baseline"
-    # Nearly all do where left and right are swapped.
-    if beyond > 0.5:
-        raise DegenerateError("RIL-375", f"{beyond:.0%} of the matches lie beyond infinity", remedy=remedy)
-    as_given, other_way = fits(rig, left, right, MAX_LINE_DISTANCE_PX), fits(rig, right, left, MAX_LINE_DISTANCE_PX)
-    if exchanged(as_given, other_way):
-        raise DegenerateError(
-            "RIL-781",
-            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy=remedy,
-        )
 
 
 def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:

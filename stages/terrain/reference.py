@@ -50,10 +50,11 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
     """
     planes = [_Plane.of(facts) for facts in levels if facts["plane"] and ("no_ground" not in facts or coarse)]
     shown = [plane for plane in planes if plane.is_ground or sum(map(plane.is_same, planes)) > 1]
-    others = sum("other_share" in facts for facts in levels)
+    others = [facts["other_up"] for facts in levels if "other_up" in facts]
     why = f"{len(shown)} of {len(levels)} pairs show ground"
     if others:
-        why += f", {others} another plane"
+        up = ", ".join(f"{v + 0.0:.2f}" for v in others[0])
+        why += f", {len(others)} another plane (if it is the ground, state its normal [{up}] as world.up in a manifest)"
     if planes and not shown:
         best = max(planes, key=lambda plane: plane.share)
         why += (
@@ -61,7 +62,7 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
             f"camera heights, where {MIN_REFERENCE_SHARE:.0%} or {MIN_REACH_HEIGHTS:g} heights, a known vertical or "
             "another pair with the same plane would show ground (terrain.reference=ground takes it for that)"
         )
-    return GroundVerdict(len(shown) > others, why)
+    return GroundVerdict(len(shown) > len(others), why)
 
 
 class _Plane(NamedTuple):

@@ -162,7 +162,7 @@ def _points(
         agrees = np.asarray(segment.resection["inlier"])[:, j] != 0
         shown[:, j, 0] = agrees & _near(rig.left, in_left, left)
         if (pair := segment.matches.get(frame)) is not None:
-            vectors, matched = matches_at(left, pair)
+            vectors, matched, _ = matches_at(left, pair)
             pixels[:, j, 1] += vectors
             shown[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
     last = rig.left.width - 1, rig.left.height - 1

@@ -14,7 +14,7 @@ Pieces that factors join become one piece, in the frame of the first of them. Pi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
-from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
+from rille.stages.geometry.rigid import compose
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
@@ -160,19 +160,14 @@ def adjust_stage(
     sensors.believe(own)
     between = Factors.joined([stated, *sensors.between(own)])
     sure = np.arange(len(between.ends)) >= len(given)
-    apart, own = own, sensors.laid(join(own, between, sure))
+    apart, own = own.poses, sensors.laid(join(own, between, sure))
     alone = own.piece[stated.ends[:, 0]] != own.piece[stated.ends[:, 1]]
     lines = [
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
     known, excess = chain.beside(stated), 1.0
-    try:
-        pieces = adjusted_pieces(own, known, sensors)
-    except DegenerateError as error:
-        lines.append(f"{error.message}: they are not joined")
-        pieces = adjusted_pieces(apart, known, sensors)
-    for nodes, inside, done in pieces:
+    for nodes, inside, done in adjusted_pieces(own, apart, known, sensors):
         excess = max(excess, done.graph.excess)
         sources = known.shared.shape[2]
         _write(out, posed[nodes], done, slice(sources - calibration, sources))
@@ -189,23 +184,25 @@ def adjust_stage(
 Piece = tuple[NDArray[np.intp], NDArray[np.intp], Adjusted]
 
 
-def adjusted_pieces(own: OwnTrajectory, known: Factors, sensors: Sensors) -> list[Piece]:
+def adjusted_pieces(own: OwnTrajectory, apart: Floats, known: Factors, sensors: Sensors) -> Iterator[Piece]:
     """Nodes of each piece that is adjusted, the numbers of the factors between them, and their adjustment.
 
-    Raises
-    ------
-    DegenerateError
-        Factors that joined a piece contradict the rest.
+    A piece that factors joined which contradict the rest falls into parts, each adjusted by itself and in the frame of
+    its first piece: ``apart`` (n, 3, 4) are poses in the frames of their pieces.
     """
-    pieces: list[Piece] = []
-    for number in np.unique(own.piece):
-        nodes = np.flatnonzero(own.piece == number)
+    waiting = [np.flatnonzero(own.piece == number) for number in np.unique(own.piece)]
+    for nodes in waiting:
         inside = np.flatnonzero(np.isin(known.ends, nodes).all(1))
         ends = np.searchsorted(nodes, known.ends[inside])
-        done = sensors.adjusted(own.take(nodes), replace(known.take(inside), ends=ends))
+        parts, done = sensors.adjusted(own.take(nodes), replace(known.take(inside), ends=ends))
         if done is not None:
-            pieces.append((nodes, inside, done))
-    return pieces
+            yield nodes, inside, done
+        elif parts.any():
+            sensors.lines.append("what joined pieces of the trajectory contradicts the rest: they are not joined")
+            for part in (nodes[parts == k] for k in np.unique(parts)):
+                before, after = (RigidTransform.from_matrix(poses[part[0]]) for poses in (own.poses, apart))
+                own.poses[part] = compose((after @ before.inverse()).matrix34, own.poses[part])
+                waiting.append(part)
 
 
 def _write(out: Chained, rows: NDArray[np.intp], done: Adjusted, calibration: slice) -> None:

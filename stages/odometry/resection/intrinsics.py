@@ -8,7 +8,8 @@ and the priors of a usual calibration give the errors and their covariance; the 
 that all segments share.
 
 The rig's yaw is an error that all disparities share: near and far landmarks ask for different motions. A straight
-drive shows that as well, so that all segments count for it, each by what its own common error says.
+drive shows that as well, so that all segments count for it, each by what its own common error says. Where one camera
+stands above the other, pitch is that error, and takes its place.
 
 A number that the tracks contradict is corrected, and all that rests on it is computed anew: images are undistorted, rig
 and segments found with the corrected calibration, so that poses and maps are of one. An error that does not contradict
@@ -131,15 +132,21 @@ def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
     return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
 
 
-def corrected_rig(rig: Rig, errors: Sequence[float] | Floats, angles: Sequence[float]) -> Rig:
-    """Rig whose cameras are changed by the first of ``errors``, and whose angles by ``angles`` (5,), rad."""
-    turned = epipolar.corrected(rig, np.array(angles))
+def corrected_rig(
+    rig: Rig, errors: Sequence[float] | Floats, yaw: float, pitch: float = 0.0, others: Sequence[float] = (0.0,) * 3
+) -> Rig:
+    """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
+
+    Where one camera stands above the other, pitch and yaw change places.
+    """
+    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
+    turned = epipolar.corrected(rig, np.array([*first, *others]))
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 
 
 def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
     """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
-    return corrected_rig(rig, correction, [0.0, correction[-1], 0.0, 0.0, 0.0])
+    return corrected_rig(rig, correction, correction[-1])
 
 
 def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Floats) -> Floats:
@@ -153,7 +160,7 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
     """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
     pitch, *others, yaw = errors[CORRECTED + 1 :]
-    other = corrected_rig(rig, errors, [pitch, yaw, *others])
+    other = corrected_rig(rig, errors, yaw, pitch, others)
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
@@ -287,14 +294,15 @@ def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
     )
 
 
-def yaw_contradiction(angle: float, sigma: float, fixed: bool) -> str:
-    """One line on a yaw that was changed by an angle, rad, or would be, were it not ``fixed``; empty where it is 0."""
+def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> str:
+    """One line on a yaw (``name``) that was changed by an angle, rad, or would be, were it not ``fixed``; empty if it
+    is 0."""
     if not angle:
         return ""
     outcome = "kept because rig.mode = fixed: depths and lengths are off by that" if fixed else "corrected"
     return (
         "the tracks contradict the rig: near and far landmarks ask for different motions, unless the right camera is "
-        f"turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees (yaw); {outcome}"
+        f"turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees ({name}); {outcome}"
     )
 
 
@@ -314,7 +322,9 @@ def intrinsics_stage(
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
     turning = [part for part in parts if part["turn_deg"] >= MIN_TURN_DEG]
-    focal = Rig.from_dict(rig.meta["rig"]).left.fx
+    given = Rig.from_dict(rig.meta["rig"])
+    focal, upright = given.left.fx, epipolar.standing(given)
+    names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     enough = [part for part in turning if len(turning) >= MIN_SEGMENTS]
     common = common_errors(
@@ -331,16 +341,17 @@ def intrinsics_stage(
     if turn and not fixed:
         correction = np.array([*np.zeros(CORRECTED), turn])
     facts: IntrinsicsFacts = {
-        "errors": dict(zip(PRIORS, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
+        "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
         "covariance": (common.covariance + np.outer(common.errors, common.errors)).tolist(),
-        "held": [name for name, share in zip(PRIORS, sigma / params.sigma, strict=True) if share > HELD_SHARE],
+        "held": [name for name, share in zip(names, sigma / params.sigma, strict=True) if share > HELD_SHARE],
         "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],
         "correction": correction.tolist(),
         "corrected": composed(made, correction).tolist(),
     }
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
-    angle = yaw_contradiction(turn if fixed else made[-1] + turn, facts["yaw"][1], fixed)
+    off = turn if fixed else made[-1] + turn
+    angle = yaw_contradiction(off, facts["yaw"][1], epipolar.angle_along(given), fixed=fixed)
     if doubt := "; ".join(filter(None, [cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.

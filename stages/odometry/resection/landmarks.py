@@ -19,7 +19,7 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import matched as is_matched
 from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.geometry.scale import of_rig
+from rille.stages.geometry.scale import right_pixels
 from rille.stages.numeric.least_squares import irls
 from rille.stages.odometry.affine_lk import HALF
 from rille.stages.odometry.displacements import windows_at
@@ -86,10 +86,10 @@ def landmarks_of(
     :data:`MAX_RELATIVE_SIGMA` of it. ``disparity_sigma``: pixels, of a disparity without relief.
     """
     # A match is as exact as the coarser pixels let it be: of the left image where the right one has finer ones.
-    unit = max(1.0, float(of_rig(rig).max()))
-    offset, matched = matches_at(points, disparity, unit)
+    unit = right_pixels(rig)
+    offset, matched, relief = matches_at(points, disparity, unit)
     right = points + offset
-    sigma = np.hypot(unit * disparity_sigma, template_planes(points, disparity, unit)[1])
+    sigma = np.hypot(unit * disparity_sigma, relief)
     landmarks = triangulated(points, right, rig, T_local_left, sigma)
     depth = T_local_left.inverse().apply(landmarks.position)[:, 2]
     off, _ = distances(rig, np.zeros(len(NAMES)), points, right)
@@ -116,8 +116,9 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
 
 
-def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Bools]:
-    """Disparity vectors (n, 2) by bilinear interpolation, and whether the four neighbours are matched and agree.
+def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Bools, Floats]:
+    """Disparity vectors (n, 2) by bilinear interpolation, whether the four neighbours are matched and agree, and the
+    relief (n,) under the template, see :func:`template_planes`.
 
     ``unit``: right pixels that :data:`MAX_DISPARITY_STEP_PX` counts in.
     """
@@ -136,9 +137,10 @@ def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Fl
     corners = np.where(good[:, None, None], corners, 0.0).astype(np.float64)
     # Between two surfaces an interpolated disparity is that of neither. On one that is steep in disparity, as ground is
     # to low cameras far from each other, or to a right one of finer pixels, neighbours differ by what its plane says.
-    on_plane = np.stack([x4, y4], -1) @ template_planes(points, disparity, unit)[0]
+    slopes, relief = template_planes(points, disparity, unit)
+    on_plane = np.stack([x4, y4], -1) @ slopes
     apart = np.minimum(np.ptp(corners, axis=1), np.ptp(corners - on_plane, axis=1))
-    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= unit * MAX_DISPARITY_STEP_PX).all(1)
+    return np.einsum("nk,nki->ni", weights, corners), good & (apart <= unit * MAX_DISPARITY_STEP_PX).all(1), relief
 
 
 def template_planes(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Floats]:

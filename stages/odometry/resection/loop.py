@@ -116,12 +116,13 @@ def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> 
 
 class Closure(NamedTuple):
     """By how much a loop corrects the chain: m, degrees, and ``chi``, the root of the mean squared error over its
-    expected standard deviation; all None between pieces. ``left_m`` is what the adjusted trajectory leaves of it."""
+    expected standard deviation; all None between pieces. ``left_m`` is what the adjusted trajectory leaves of it, None
+    where that has not joined the pieces."""
 
     move_m: float | None
     turn_deg: float | None
     chi: float | None
-    left_m: float
+    left_m: float | None
 
 
 def closure(factor: Mapping[str, Any], chained: Bundle, adjusted: Bundle) -> Closure:
@@ -130,6 +131,8 @@ def closure(factor: Mapping[str, Any], chained: Bundle, adjusted: Bundle) -> Clo
     measured, loop = RigidTransform.from_matrix(factor["pose"]), np.reshape(factor["covariance"], (6, 6))
     a, b = (RigidTransform.from_matrix(adjusted["poses"][row]) for row in rows)
     left = float(np.linalg.norm(b.translation - (a @ measured).translation))
+    if len(set(adjusted["piece"][rows])) > 1:
+        return Closure(None, None, None, None)
     if len(set(chained["piece"][rows])) > 1:
         return Closure(None, None, None, left)
     a, b = (RigidTransform.from_matrix(chained["poses"][row]) for row in rows)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
@@ -17,10 +18,11 @@ from rille.stages.core.validity import matched
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.scale import right_pixels
 from rille.stages.odometry.resection.landmarks import triangulated
 
 DISPARITY_SIGMA_PX = 0.3
-"""Standard deviation of a disparity, with what a coarse pixel holds of relief."""
+"""Standard deviation of a disparity [pixels of the coarser image], with what a coarse pixel holds of relief."""
 SIGMAS = 3.0
 """Times that by which a place may be off."""
 MIN_DEPARTURE_PX = 1.5
@@ -51,32 +53,29 @@ def departures(
     T_b_a : motion of the camera.
     back : the pair is that of image b and not of a.
     """
-    scale = 2.0 ** motion.meta["level"]
+    scale = 2 ** int(motion.meta["level"])
     shift = np.stack([np.asarray(motion[name], np.float64) for name in ("column_disparity", "row_disparity")], -1)
     shift[~matched(np.asarray(motion["validity"]))] = np.nan
     shape = shift.shape[:2]
     cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
-    here = np.asarray((cells + 0.5) * scale - 0.5, np.float64)
-    points = triangulated(
-        here, here + _coarse(disparity, here), rig, RigidTransform.identity(), np.full(len(here), DISPARITY_SIGMA_PX)
-    )
+    # Coarse pixels may reach beyond the end of the image.
+    here = np.minimum(cells * scale + scale // 2, np.subtract(np.shape(disparity["validity"])[::-1], 1))
+    right, sigma = here + _disparities(disparity, here), right_pixels(rig) * DISPARITY_SIGMA_PX
+    points = triangulated(here.astype(float), right, rig, RigidTransform.identity(), np.full(len(here), sigma))
     to = T_b_a.inverse() if back else T_b_a
-    there, farther = (
-        rig.left.project(to.apply(points.position + share * points.per_pixel)) for share in (0.0, DISPARITY_SIGMA_PX)
-    )
+    there, farther = (rig.left.project(to.apply(points.position + share * points.per_pixel)) for share in (0.0, sigma))
     # From a pair of image b the still scene leads to its place in a, whose displacement must lead back.
     measured = _at(shift, (there + 0.5) / scale - 0.5) if back else shift.reshape(-1, 2)
     off = np.linalg.norm(there + measured - here if back else here + measured - there, axis=1)
     return np.asarray((off - SIGMAS * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
 
 
-def _coarse(disparity: Bundle, places: Floats) -> Floats:
-    """Disparities (n, 2) of the pixels at some places (n, 2), column and row, in the image or beside its end; NaN
-    unmatched."""
-    good = matched(np.asarray(disparity["validity"]))
-    col, row = np.minimum((places + 0.5).astype(np.intp), [good.shape[1] - 1, good.shape[0] - 1]).T
+def _disparities(disparity: Bundle, pixels: NDArray[np.intp]) -> Floats:
+    """Disparities (n, 2) of pixels (n, 2), column and row; NaN unmatched."""
+    col, row = pixels.T
     maps = [np.asarray(disparity[n])[row, col] for n in ("column_disparity", "row_disparity")]
-    return np.where(good[row, col, None], np.stack(maps, axis=-1), np.nan).astype(np.float64)
+    good = matched(np.asarray(disparity["validity"])[row, col])
+    return np.where(good[:, None], np.stack(maps, axis=-1), np.nan).astype(np.float64)
 
 
 def _at(shift: Floats, places: Floats) -> Floats:

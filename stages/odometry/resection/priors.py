@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.errors import DegenerateError
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
 from rille.stages.odometry.resection.sensors import (
@@ -124,38 +124,36 @@ class Sensors:
         self.used["positions"] = replace(positions, laid=found[0])
         return found[1]
 
-    def adjusted(self, own: OwnTrajectory, known: Factors) -> Adjusted | None:
+    def adjusted(self, own: OwnTrajectory, known: Factors) -> tuple[NDArray[np.int32], Adjusted | None]:
         """A piece adjusted to its chain and stated factors (``known``) and to the sensors; None: nothing to adjust.
 
-        The place is a node behind those of the piece.
-
-        Raises
-        ------
-        DegenerateError
-            The factors that are kept do not hold the piece together.
+        None as well where the factors that are kept do not hold the piece together; with the parts (nodes,) of it that
+        they do hold. The place is a node behind those of the piece.
         """
         clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
-        done = None
+        done, whole = None, np.zeros(nodes, np.int32)
         # First the clocks: the remaining errors then show better by how much the chain's exceed its covariances.
         for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
             said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
             groups = {name: factors for name, factors in said.items() if len(factors.ends)}
             if not groups and not known.doubtful.any():
-                return None
+                return whole, None
             factors = Factors.joined([known, *groups.values(), anchor(own.poses[0])])
             ends = np.where(factors.ends < 0, nodes, factors.ends)
             graph = PoseGraph(replace(factors, ends=ends), nodes + 1, np.ones(len(ends)), common=common)
             start = GraphState.of(np.concatenate([own.poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
-            _check_whole(graph, np.ones(len(ends), bool))
+            if (parts := graph.parts(np.ones(len(ends), bool))).any():
+                return parts[:-1], None
             done = adjust(graph, start, excesses)
-            _check_whole(graph, done.kept)
+            if (parts := graph.parts(done.kept)).any():
+                return parts[:-1], None
             if excesses == EXCESS and not self._refused(groups, done, len(known.ends), common):
                 break
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
         self._account(groups, clocks, done.state.poses[-1])
-        return done
+        return whole, done
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
         """Whether a sensor is not believed: most was left out, or what all share is far off its standard deviation.
@@ -228,9 +226,3 @@ class Sensors:
                 where = ", ".join(f"{v:.2f}" for v in origin)
                 text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
                 self.lines.append(f"{text}: state these with world.crs, and maps lie there")
-
-
-def _check_whole(graph: PoseGraph, kept: Bools) -> None:
-    """Refuse a graph of which those factors alone that are ``kept`` (m,) leave nodes without a position."""
-    if not graph.holds_together(kept):
-        raise DegenerateError("RIL-396", "what joined pieces of the trajectory contradicts the rest")

@@ -28,6 +28,7 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.pose_arrays import BY_INTRINSICS, COVARIANCE, POSES, SHARED
+from rille.stages.geometry.scale import right_pixels
 from rille.stages.odometry.resection.bundle_adjustment import PosedTracks, SegmentAdjustment, adjust, pose_errors
 from rille.stages.odometry.resection.intrinsics import PRIORS, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
@@ -42,8 +43,8 @@ from rille.stages.odometry.resection.robust_pose import (
 from rille.stages.odometry.resection.two_motions import AmbiguousError, moving_by_themselves
 
 MIN_JUMP_PX = 1.0
-"""Median departure [pixels] of a basic pair's disparities from the pair's before from which on the rig was knocked;
-of sound rigs it stays below 0.2."""
+"""Median departure [pixels of the coarser image] of a basic pair's disparities from the pair's before from which on the
+rig was knocked; of sound rigs it stays below 0.2."""
 
 
 @dataclass(frozen=True)
@@ -158,22 +159,24 @@ def adjust_segment(
 
 
 def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:
-    """A line and a jump, px, where the basic pair at the segment's end contradicts the landmarks: the rig has moved.
+    """A line and a jump where the basic pair at the segment's end contradicts the landmarks: the rig has moved.
 
-    A turn of a camera to the side shows in no row of one pair, but all its disparities jump by as much.
+    The jump is in pixels of the coarser image. A turn of a camera to the side shows in no row of one pair, but all its
+    disparities jump by as much.
 
     Parameters
     ----------
     after, rig : disparity and rig of that pair.
     """
     pose = segment.poses[-1]
-    disparity, matched = matches_at(points.tracks[:, -1].astype(np.float64), after)
+    unit = right_pixels(rig)
+    disparity, matched, _ = matches_at(points.tracks[:, -1].astype(np.float64), after, unit)
     use = matched & (segment.inlier[:, -1] != 0)
     if not np.isfinite(pose).all() or use.sum() < MIN_LANDMARKS:
         return None
     at = RigidTransform.from_matrix(pose).inverse().apply(points.landmarks.position[use])
     expected = rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)
-    jump = np.median(disparity[use] - expected, axis=0)
+    jump = np.median(disparity[use] - expected, axis=0) / unit
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
         return None
     line = (

@@ -181,14 +181,12 @@ def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle])
     sources = []
     for piece in range(int(found.piece.max()) + 1):
         mine = [(key, level) for key, level in zip(keys, levels, strict=True) if found.piece[key] == piece]
-        source = mine[0][1].meta.get("source", "") if mine else NO_VERTICAL
-        known = ((key, level) for key, level in mine if level.meta["source"] != NO_VERTICAL)
-        if source == NO_VERTICAL and (one := next(known, None)) is not None:
-            key, level = one
-            R_local_left = RigidTransform.from_matrix(level.meta["T_local_left"]).rotation
+        known = [(key, level.meta) for key, level in mine if level.meta["source"] != NO_VERTICAL]
+        if known and known[0][0] != mine[0][0]:
+            key, meta = known[0]
+            R_local_left = RigidTransform.from_matrix(meta["T_local_left"]).rotation
             _level(found, piece, found.poses[key, :, :3] @ R_local_left[2])
-            source = level.meta["source"]
-        sources.append(source)
+        sources.append(known[0][1]["source"] if known else NO_VERTICAL)
     return sources
 
 

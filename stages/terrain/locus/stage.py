@@ -289,18 +289,11 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         view = seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level)
         T, lattice = T_local_left, local_lattice(view, cell, params)
         z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))
-    matched = MatchedPair(
-        inputs.left["level_0"],
-        matches,
-        inputs.right["level_0"] if inputs.right is not None else None,
-        back,
-    )
-    low, high = z_range
+    right = None if inputs.right is None else inputs.right["level_0"]
+    matched, (low, high) = MatchedPair(inputs.left["level_0"], matches, right, back), z_range
     dem = reconstruct(matched, rig, T, lattice, (low, high), params.model_copy(update=NO_LIMIT))
     greatest = greatest_std(params, matches.std is not None)
-    covered: dict[str, Any] | None = None
-    if seen is not None:
-        covered = coverage(seen, dem, lattice, (low, high), greatest or math.inf, params)
+    covered = None if seen is None else coverage(seen, dem, lattice, (low, high), greatest or math.inf, params)
     leave_out_unsure(dem, greatest)
     if not np.isfinite(dem.elevation).any():
         raise explain(rig, T, lattice, (low, high), matches.usable)

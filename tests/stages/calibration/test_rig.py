@@ -205,7 +205,7 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
             for k, row in enumerate(degrees)
         ]
         last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
-        return _drift([*start[:-1], last], rows, RigParams())[0]
+        return _drift([*start[:-1], last], rows, RigParams(), 1.0)[0]
 
     alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
     assert told(away, shown=True) == []
@@ -213,10 +213,28 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
     assert told(alone, shown=True)[0].startswith(f"the rig moves: {NAMES[strong].replace('_', ' ')} of 1 of 5 pairs")
 
 
-def test_swapped_images_lie_beyond_infinity():
+def test_swapped_images_are_named():
     pairs = [PointPairs(m.pair, m.right, m.left) for m in street(2)]
-    with raises("RIL-428"):
+    with raises("RIL-781"):
         facts(street_rig(), pairs)
+
+
+def test_images_of_unlike_scenes_are_not_called_swapped():
+    rng = np.random.default_rng(2)
+    left = rng.uniform(0, (1225, 369), (600, 2))
+    pairs = [PointPairs(0, left, left + np.stack([rng.uniform(5, 60, 600), rng.normal(0, 3, 600)], 1))]
+    with raises("RIL-375", "one scene"):
+        facts(street_rig(), pairs)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_rows_count_in_pixels_of_the_coarser_image(scale):
+    rig = street_rig()
+    right = replace(rig.right, fx=scale * rig.right.fx, fy=scale * rig.right.fy, width=2452, height=740)
+    finer = Rig(rig.left, replace(right, cx=scale * rig.right.cx, cy=scale * rig.right.cy), rig.T_right_left)
+    found = facts(finer, [matches(finer, street_depth, noise=0.8 * scale, pair=k) for k in range(2)])
+    assert "suspects" not in found
+    assert found["warnings"] == []
 
 
 def test_distortion_that_was_left_is_told():

@@ -78,17 +78,19 @@ def test_places_against_a_look_at_every_wheel_and_part_of_the_belly() -> None:
     high[rng.random(high.shape) < 0.1] = np.nan
     low[np.isnan(high)] = np.nan
     whole = np.isfinite(high) & (rng.random(high.shape) < 0.95)
-    found, at = place(high, low, MODEL, cell, whole), Stance.of(MODEL, cell)
+    found, at, rim = place(high, low, MODEL, cell, whole), Stance.of(MODEL, cell), 40
+    rows, cols = high.shape
+    # Beyond the map all is unknown.
+    high, low = (np.pad(a, rim, constant_values=np.nan) for a in (high, low))
+    whole = np.pad(whole, rim)
 
     def look(maps: list[np.ndarray], r: int, c: int, reach: int) -> list[float]:
-        """Highest value of each map around a cell; NaN where none is known or the cell is not on the map."""
-        if not (0 <= r < high.shape[0] and 0 <= c < high.shape[1]):
-            return [math.nan] * len(maps)
-        part = np.s_[max(r - reach, 0) : r + reach + 1, max(c - reach, 0) : c + reach + 1]
+        """Highest value of each map around a cell; NaN where none is known."""
+        part = np.s_[r + rim - reach : r + rim + reach + 1, c + rim - reach : c + rim + reach + 1]
         return [max(a[part][~np.isnan(a[part])], default=math.nan) for a in maps]
 
-    for r in range(0, high.shape[0], 2):
-        for c in range(high.shape[1]):
+    for r in range(0, rows, 2):
+        for c in range(cols):
             squares, rises, gaps = [[], []], [0.0], []
             for wheels, belly, spans in zip(at.wheels, at.belly, at.spans.astype(float), strict=True):
                 stood = np.array([look([high, -low, ~whole], r + y, c + x, at.wheel_reach) for y, x in wheels])

@@ -123,6 +123,9 @@ def test_a_single_wrong_cell_on_fine_ground_is_no_rock_but_a_coarse_post_is() ->
     for cell in (FINE, 0.003):  # five of which are a wheel's radius
         assert (judge(z, cell)["risk"] == HAZARDOUS).sum() == 0
     z[50, 60] = 0.5
+    # Five cells of 0.07 m are 0.35 m but for their rounding.
+    large = DEFAULT_VEHICLE.model_copy(update={"wheel_diameter": 0.7})
+    assert (judge(z, cell=0.07, vehicle=large)["risk"] == HAZARDOUS).sum() == 0
     assert (judge(z, cell=0.1, vehicle=DEFAULT_VEHICLE)["risk"] == HAZARDOUS).sum() >= 9
 
 
@@ -159,6 +162,15 @@ def test_unknown_does_not_grow_and_what_is_near_it_is_not_called_safe() -> None:
     assert (out["risk"][100:150, 150:200] == SAFE).all()
     np.testing.assert_array_equal(np.argwhere(out["filled"]), np.argwhere(np.isnan(z) & (np.arange(300) > 100)))
     assert ((out["reason"] & FILLED_BIT) > 0).sum() == 9
+
+
+def test_beside_its_border_a_map_is_judged_as_beside_unknown_ground() -> None:
+    """Wheels that stand a little beyond the border still touch the ground within it."""
+    rng = np.random.default_rng(4)
+    z = np.cumsum(rng.normal(scale=0.1 * MODEL.max_step, size=(120, 112)), axis=0)
+    alone, among = judge(z), judge(np.pad(z, 40, constant_values=np.nan))
+    for name in ("risk", "reason", "slope", "tilt", "clearance", "p_hazard"):
+        np.testing.assert_array_equal(alone[name], among[name][40:-40, 40:-40], err_msg=name)
 
 
 def test_a_closed_hole_is_as_uncertain_as_its_rim_is_uneven() -> None:

@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from matching_scenes import convergent_rig, pair, rig_displacement
 from scipy import ndimage
 
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, level, paper, plane, refinement
-from rille.stages.hfvm.finest import FAILED_PX, Fine, FinestWork, backmatch, isolated, speckles
+from rille.stages.hfvm.finest import FAILED_PX, Ending, Fine, FinestWork, backmatch, complete, isolated, speckles
 from rille.stages.hfvm.image import Window, as_matched
 from rille.stages.hfvm.image import planes as table_1
 from rille.stages.hfvm.level import Map, PyramidPair, Recipe, agree
@@ -162,6 +163,26 @@ class TestEpipolar:
         u, v, wanted, *_ = rig_matches(swapped, outliers=0.0)
         f, _ = fit(u, v, wanted)
         assert epipolar.near_sign(f, u[wanted], wanted.shape, wanted.shape) == 1.0
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_where_lines_run_along_the_columns_gaps_are_filled_as_along_the_rows(sign):
+    """Maps whose rows and columns are exchanged: the same of everything, exchanged."""
+    rng = np.random.default_rng(6)
+    shape, f = (40, 60), np.array([[0.0, 0.0, 0.1], [0.0, 0.0, -1.0], [0.05, 1.02, 0.3]])
+    near, validity = rng.random(shape) < 0.3, np.where(rng.random(shape) < 0.4, Validity.BACKMATCH_FAILED, 0)
+    u = np.where(near, sign * 9.0, 0.0).astype(np.float32)
+    maps = {"u": u, "v": zeros(*shape), "error": zeros(*shape), "distance": zeros(*shape), "noise": zeros(*shape)}
+    maps["validity"] = validity.astype(np.uint8)
+    params, outer = HfvmParams(min_support=0.0), Window(0, shape[0], 0, shape[1])
+    rows = complete(maps, np.ones(shape, np.uint8), outer, params, Ending(shape, sign, f=f))
+    turned = {name: np.ascontiguousarray(a.T) for name, a in maps.items()} | {"u": maps["v"].T, "v": maps["u"].T}
+    window, ending = Window(0, shape[1], 0, shape[0]), Ending(shape[::-1], sign, f=epipolar.transposed(f), upright=True)
+    cols = complete(turned, np.ones(shape[::-1], np.uint8), window, params, ending)
+    assert (rows["validity"] & Validity.INTERPOLATED).any()
+    for name, other in {"column_disparity": "row_disparity", "row_disparity": "column_disparity"}.items():
+        np.testing.assert_array_equal(cols[name].T, rows[other])
+    np.testing.assert_array_equal(cols["validity"].T, rows["validity"])
 
 
 class TestPlane:

@@ -8,6 +8,7 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.odometry.pose_graph import Factors, GraphState, PoseGraph, adjust, root_of
 from rille.stages.odometry.resection.adjust import adjust_stage
+from rille.stages.odometry.resection.loop import closure
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 
 STEP = np.diag([2e-3, 1e-3, 3e-3, 1e-3, 2e-3, 5e-4]) ** 2
@@ -223,6 +224,8 @@ def test_a_link_that_no_other_agrees_with_joins_no_pieces():
         out = adjusted(segments, before, *links)
         assert out.meta["pieces"] == before.meta["pieces"]
         assert len([line for line in out.meta["warnings"] if "alone link" in line]) == len(links)
+        # Between the frames of two pieces there is no distance.
+        assert closure(links[0], before, out).left_m is None
 
 
 def test_a_piece_that_nothing_joins_stays_as_it_is():
@@ -258,6 +261,20 @@ def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames
     ]
     # Half a round of 5 m lies 10 m away.
     assert shares == pytest.approx([0.1, 0.1], rel=0.15)
+
+
+def test_links_that_contradict_leave_other_pieces_joined():
+    truth, rng = ring(16), np.random.default_rng(6)
+    segments, before = run_of(truth, rng, lost={6, 12})
+    assert len(before.meta["pieces"]) == 3
+    links = [seen(truth, a, b, rng) for a, b in ((1, 10), (2, 9), (8, 14), (9, 13))]
+    links[-1]["pose"][3] += 0.15
+    out = adjusted(segments, before, *links)
+    assert out.meta["pieces"] == [[0, 11], [12, 15]]
+    assert [line for line in out.meta["warnings"] if "not joined" in line]
+    np.testing.assert_array_equal(out["poses"][12:], before["poses"][12:])
+    here = slice(0, 12)
+    assert np.nanmax(np.linalg.norm(errors({"poses": out["poses"][here]}, truth[here])[:, :3], axis=1)) < 0.05
 
 
 def test_links_that_contradict_each_other_join_no_pieces():

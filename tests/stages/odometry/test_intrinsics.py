@@ -38,14 +38,14 @@ POINTS = 80
 
 
 def segment(
-    seed: int, given: Camera, lens: Lens, turn: float, yaw: float = 0.0
+    seed: int, given: Camera, lens: Lens, turn: float, yaw: float = 0.0, base: RigidTransform = T_RIGHT_LEFT
 ) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
     """A camera of 450 px that turns by some ``turn`` radians, and is taken for the given one; true poses.
 
     The given rig's right camera is turned by ``yaw``, rad.
     """
     rng = np.random.default_rng(seed)
-    rig = calibrated_anew(Rig(given, given, T_RIGHT_LEFT), [0.0, 0.0, 0.0, yaw])
+    rig = calibrated_anew(Rig(given, given, base), [0.0, 0.0, 0.0, yaw])
     wrong = replace(lens, camera=given)
 
     def measured(points):
@@ -56,7 +56,7 @@ def segment(
     moves = [
         RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3)) for k in (1, 2)
     ]
-    landmarks = triangulated(measured(X), measured(T_RIGHT_LEFT.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
+    landmarks = triangulated(measured(X), measured(base.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
     pixels = np.array([measured(move.apply(X)) for move in moves])
     tracks = SegmentTracks(landmarks, pixels, np.ones((2, POINTS), bool), given)
     true = [move @ LEVEL.inverse() for move in moves]
@@ -67,11 +67,13 @@ def segment(
     return tracks, state, SegmentCameras(rig, lenses, LEVEL)
 
 
-def facts_of(given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, **known):
+def facts_of(
+    given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, base: RigidTransform = T_RIGHT_LEFT, **known
+):
     """Facts that eight segments lead to, of a camera that is given, and of a rig that is off by a yaw."""
     parts = []
     for seed in range(8):
-        tracks, state, cameras = segment(seed, given, lens, turn, yaw)
+        tracks, state, cameras = segment(seed, given, lens, turn, yaw, base)
         end = adjust(tracks, state, PARAMS).state
         part = contribution(tracks, end, cameras, PARAMS)
         facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": part.yaw}
@@ -120,10 +122,12 @@ def test_a_straight_drive_rests_on_the_given_numbers_and_their_prior():
 
 
 @pytest.mark.parametrize("yaw", [0.003, -0.006])
-def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw):
-    off, before = yaw, 0.0
+@pytest.mark.parametrize(("centre", "name"), [((-0.12, 0.0, 0.0), "yaw"), ((0.01, -0.12, 0.0), "pitch")])
+def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, name):
+    """Of cameras one above the other, it is the pitch that moves all disparities."""
+    off, before, base = yaw, 0.0, RigidTransform(np.eye(3), np.array(centre))
     for _ in range(4):
-        facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=off, before=[0.0, 0.0, 0.0, before])
+        facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=off, base=base, before=[0.0, 0.0, 0.0, before])
         assert facts["correction"][:CORRECTED] == [0.0] * CORRECTED
         off, before = off + facts["correction"][-1], before + facts["correction"][-1]
         if not facts["correction"][-1]:
@@ -131,7 +135,8 @@ def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw):
     assert abs(off) * CAMERA.fx < 0.15
     assert "contradiction" not in facts  # all that rests on it is computed anew
     assert f"{np.degrees(before):+.3f}" in facts["warnings"][0]
-    assert facts["warnings"][0].endswith("corrected")
+    assert facts["warnings"][0].endswith(f"degrees ({name}); corrected")
+    assert ("yaw" if name == "pitch" else "pitch") in facts["errors"]
 
 
 def test_a_yaw_is_kept_where_the_rig_is_fixed():

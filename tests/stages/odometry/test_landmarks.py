@@ -77,7 +77,7 @@ def test_filled_missing_and_torn_disparities_give_no_landmark():
 def test_the_last_row_and_column_have_disparities_and_nothing_lies_beyond():
     column, row, valid, _ = plane_disparity()
     points = np.array([[319.0, 239.0], [0.0, 0.0], [319.0, 100.5], [319.1, 100.0], [100.0, 239.1]])
-    found, ok = matches_at(points, pair(column, row, valid))
+    found, ok, _ = matches_at(points, pair(column, row, valid))
     assert ok.tolist() == [True, True, True, False, False]
     middle = np.array([m[100:102, 319].mean(dtype=float) for m in (column, row)])
     np.testing.assert_allclose(found[:3], [[column[-1, -1], row[-1, -1]], [column[0, 0], row[0, 0]], middle])

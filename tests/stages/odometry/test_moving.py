@@ -28,7 +28,9 @@ def depths() -> np.ndarray:
     return out
 
 
-def given(board_moves: float, *, back: bool = False, noise: float = 0.0) -> tuple[Bundle, Bundle, Bundle]:
+def given(
+    board_moves: float, *, back: bool = False, noise: float = 0.0, rig: Rig = RIG
+) -> tuple[Bundle, Bundle, Bundle]:
     """Disparity of the pair, displacements from image a to b, and the segment's poses.
 
     The board moves by so many metres to the right; ``back``: the pair is that of image b.
@@ -36,7 +38,8 @@ def given(board_moves: float, *, back: bool = False, noise: float = 0.0) -> tupl
     rng, depth, step = np.random.default_rng(2), depths(), 2**LEVEL
     pixels = np.stack(np.meshgrid(np.arange(COLS), np.arange(ROWS)), -1).reshape(-1, 2).astype(np.float64)
     points = CAMERA.rays(pixels) * depth.reshape(-1, 1)
-    right = RIG.right.project(RIG.T_right_left.apply(points)) - pixels + rng.normal(0, 0.1, pixels.shape)
+    right = rig.right.project(rig.T_right_left.apply(points)) - pixels
+    right += rng.normal(0, 0.1 * rig.right.fx / CAMERA.fx, pixels.shape)
     names = ("column_disparity", "row_disparity")
     maps = {name: right[:, k].reshape(ROWS, COLS).astype(np.float32) for k, name in enumerate(names)}
     all_matched = np.full((ROWS, COLS), Validity.MATCHED, np.uint8)
@@ -106,8 +109,11 @@ def test_a_board_that_is_pushed_aside_is_found_and_little_beside_it(back: bool) 
 
 
 def test_a_departure_is_what_the_distance_leaves_unexplained() -> None:
-    disparity, motion, _ = given(0.0)
-    assert np.nanmedian(departures(disparity, motion, RIG, T_B_A, back=False)) < 0
+    """Pixels of the right camera that are finer than the left one's make nothing more certain."""
+    finer = Rig(CAMERA, Camera(450.0, 450.0, 238.5, 142.5, 3 * COLS, 3 * ROWS), RIG.T_right_left)
+    alike, other = (departures(*given(0.0, rig=rig)[:2], rig, T_B_A, back=False) for rig in (RIG, finer))
+    assert np.nanmedian(alike) < 0
+    assert np.nanmedian(other) == pytest.approx(np.nanmedian(alike), abs=0.02)
 
 
 def test_where_nothing_is_known_nothing_moves() -> None:

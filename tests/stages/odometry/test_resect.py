@@ -457,11 +457,13 @@ def test_a_vehicle_ahead_and_few_that_pass_leave_the_motion_as_it_is(near, far, 
 @pytest.mark.parametrize(
     ("column", "row", "told"), [(3.0, 0.0, True), (-2.0, 0.0, True), (0.0, 1.5, True), (0.5, 0.2, False)]
 )
-def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
+@pytest.mark.parametrize("finer", [1.0, 2.0])
+def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, finer):
     """The later pair measures disparities that all depart alike from those of the landmarks."""
     rng = np.random.default_rng(31)
     step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.4]))
-    rig = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.array([-0.3, 0.0, 0.0])))
+    right = Camera(*(finer * value for value in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)), 1200, 1000)
+    rig = Rig(CAMERA, right, RigidTransform(np.eye(3), np.array([-0.3, 0.0, 0.0])))
     landmarks = scene(rng, 80)
     landmarks[:, 2] = 8.0  # a wall: one disparity at the key, and another one behind the step
     points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
@@ -471,8 +473,8 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told):
     depth = (8.0 - step.translation[2]) / rays[:, 2]
     shape = (CAMERA.height, CAMERA.width)
     disparity = {
-        "column_disparity": (column - 0.3 * CAMERA.fx / depth).reshape(shape).astype(np.float32),
-        "row_disparity": np.full(shape, row, np.float32),
+        "column_disparity": (finer * (u.ravel() + column - 0.3 * CAMERA.fx / depth) - u.ravel()).reshape(shape),
+        "row_disparity": finer * (v + row) - v,
         "validity": np.full(shape, Validity.MATCHED, np.uint8),
     }
     jumped = knocked(given, found, Bundle(disparity, {}), rig)

@@ -101,7 +101,10 @@ def broken_run(lost_rows, frames=8, cuts=((0, 3), (3, 6), (6, 7)), moved=False):
                 local[i - a], facts[i - a] = np.nan, {"frame": i, "inliers": 0, "lost": "too few landmarks"}
         arrays = {"poses": local, "covariance": np.zeros((b - a + 1, 6, 6)), "shared": NONE[: b - a + 1]}
         segments.append(Bundle(arrays, {"per_frame": facts}))
-    inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
+    inputs = {
+        "segments": segments,
+        "levels": [Bundle({}, {"T_local_left": T.to_list(), "source": "pitch"}) for T in levels],
+    }
     steps = {"steps": [[0.2, 0.3]] * (frames - 1)} if moved else {}
     out = trajectory_stage.run(NoParams(), {"frames": list(range(frames))} | steps, inputs)
     check_outputs(trajectory_stage, out)
@@ -171,7 +174,10 @@ def test_poses_and_their_covariances_are_chained():
         n = b - a + 1
         arrays = {"poses": local, "covariance": np.tile(claimed, (n, 1, 1)), "shared": NONE[:n]}
         segments.append(Bundle(arrays, {"per_frame": [{"frame": i, "inliers": 9} for i in range(a, b + 1)]}))
-    inputs = {"segments": segments, "levels": [Bundle({}, {"T_local_left": T.to_list()}) for T in levels]}
+    inputs = {
+        "segments": segments,
+        "levels": [Bundle({}, {"T_local_left": T.to_list(), "source": "pitch"}) for T in levels],
+    }
     out = trajectory_stage.run(NoParams(), {"frames": list(range(8))}, inputs)
     # Of a frame of the first segment it is what was claimed, in the world: both parts are the same about all axes.
     np.testing.assert_allclose(out["covariance"][1], claimed, atol=1e-18)

@@ -253,7 +253,8 @@ def test_a_plane_through_the_camera_is_refused() -> None:
 
 def test_what_no_frame_can_be_posed_from_is_said_with_a_remedy() -> None:
     swapped = Rig(RIG.right, RIG.left, RIG.T_right_left)
-    with raises("RIL-375"):
+    # Their rows fit the rig neither as given nor with its sides exchanged.
+    with raises("RIL-375", "one scene"):
         level(-FLAT[0], FLAT[1], FLAT[2], swapped, PARAMS)
     # Turned inward, the cameras see far ground ahead with their sides exchanged, too, but off the epipolar lines.
     inside_out = disparity(Rig(RIG.right, RIG.left, RIG.T_right_left.inverse()), POSE, plane(0.0, 0.0, -8.0 * HEIGHT))

@@ -10,7 +10,7 @@ from rille.stages.geometry.pose_arrays import GROUND_PLANE
 from rille.stages.terrain.reference import MAX_TILT_DEG, MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE, judge
 
 WALL = {"no_ground": "a wall", "plane": None, "ground_share": 0.0}
-OTHER = {**WALL, "other_share": 0.6}
+OTHER = {**WALL, "other_up": [0.8, -0.6, 0.0]}
 
 
 def ground(share: float = 0.2, reach: float = 3.0, height: float = 1.6, roll: float = 0.0, **facts: Any) -> Any:
@@ -52,4 +52,5 @@ def test_ground_too_far_for_the_rig_counts_where_a_cell_size_is_stated() -> None
 
 def test_the_reason_holds_the_figures() -> None:
     why = judge([ground(0.29, 3.2), OTHER], coarse=False).why
-    assert [part for part in ("0 of 2", "1 another plane", "29%", "3.2 camera heights", "40%") if part not in why] == []
+    figures = "0 of 2", "1 another plane", "29%", "3.2 camera heights", "40%", "[0.80, -0.60, 0.00]"
+    assert [part for part in figures if part not in why] == []
