@@ -248,7 +248,7 @@ class PoseFile(Table):
     file : poses, one a pair, or with times.
     format : kitti 3 x 4, tum, euroc or csv.
     T_body_left : rows of [R | t], m: from the left camera's frame to the body's whose poses the file has.
-    unit : m; length of one unit of the file, 0.001 where it says mm.
+    unit : m; length of one unit of the file, 0.001 where it says mm; by default as its columns' names say, else 1.
     max_gap : s; poses are interpolated over no longer gap.
     time_offset : s; added to the file's times so that they are those of the images.
     source : words: where the poses come from.
@@ -257,7 +257,7 @@ class PoseFile(Table):
     file: str
     format: PoseFormat = "auto"
     T_body_left: Pose | None = None
-    unit: float = Field(default=1.0, gt=0)
+    unit: float | None = Field(default=None, gt=0)
     max_gap: float = Field(default=0.5, gt=0)
     time_offset: float = 0.0
     source: str = ""
@@ -292,7 +292,7 @@ class PositionFile(Table):
     sigma : m; standard deviation of each coordinate, or of x, y and z.
     lever_arm : m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead.
     columns : names or numbers (from 1) of the columns, as for truth; names that are clear need none.
-    unit : m; length of one unit of the file.
+    unit : m; length of one unit of the file; by default as its columns' names say, else 1.
     time_offset : s; added to the file's times so that they are those of the images; what is left of it is estimated.
     """
 
@@ -300,7 +300,7 @@ class PositionFile(Table):
     sigma: Deviation | tuple[Deviation, Deviation, Deviation]
     lever_arm: Vector = (0.0, 0.0, 0.0)
     columns: Columns = Field(default={})
-    unit: float = Field(default=1.0, gt=0)
+    unit: float | None = Field(default=None, gt=0)
     time_offset: float = 0.0
 
 
