@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from rille.datasets.georeference import Georeference, metric_crs
+from rille.datasets.georeference import Georeference, are_degrees, metric_crs
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.validation import TAG, validated
 from rille.stages.core.declare import Params
@@ -387,6 +387,10 @@ class World(Table):
         missing = [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
         if len(missing) in (1, 2):
             raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
+        if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
+            raise ValueError(
+                f"origin = {list(self.origin)} looks like degrees: give easting, northing and height in {self.crs}, m"
+            )
         return self
 
     @property
