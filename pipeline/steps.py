@@ -23,12 +23,13 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import index, methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
 from rille.datasets import registry
@@ -54,12 +55,10 @@ class StereoSequence:
 
     Attributes
     ----------
-    place : what it was opened by.
     drawn : images that were read or rendered already, by label.
     """
 
     source: Sequence
-    place: str = field(default="", compare=False)
     drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -165,8 +164,10 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     (9, ('row', 'col'))
     """
     check_place(path)
-    check_sections(settings)
-    return StereoSequence(registry.open_sequence(str(path), settings), str(path))
+    words = assignments(settings)
+    opened = registry.open_sequence(str(path), settings)
+    said = (word for one in words for word in ("--set", one))
+    return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
 
 
 def check_place(path: object) -> None:
@@ -182,6 +183,27 @@ def check_sections(settings: Mapping[str, object]) -> None:
         if not isinstance(values, Mapping):
             text = f"{section}={values!r} is no section"
             raise ConfigError("RIL-861", text, remedy=f'give {section}={{"name": value}}')
+
+
+def assignments(settings: Mapping[str, Settings]) -> list[str]:
+    """Return the same settings as assignments for ``--set``.
+
+    >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
+    ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
+    """
+    words = []
+    check_sections(settings)
+    for section, values in settings.items():
+        for name, value in values.items():
+            try:
+                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
+            except TypeError:
+                text = f"{section}.{name} = {value!r} is no value of TOML"
+                remedy = "give a number, a text, True or False, or a list of these; or leave it out"
+                raise ConfigError("RIL-866", text, remedy=remedy) from None
+            # Only a list has several lines: the line feed of a text is escaped.
+            words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
+    return words
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
