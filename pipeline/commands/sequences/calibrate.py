@@ -45,10 +45,6 @@ MAX_FOCAL_SIGMA = 0.01
 MIN_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
-
-OURS = "x_right = R x_left + T, metres; board in inner corners, square in metres, residuals in pixels RMS"
-"""Comment in the files that are written."""
-
 Image = NDArray[Any]
 
 
@@ -108,7 +104,7 @@ def calibrate(
         Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
-    if output.exists() and OURS not in read_text(output, "calibration"):
+    if output.exists() and "avg_reprojection_error:" not in read_text(output, "calibration"):
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
@@ -275,7 +271,7 @@ def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
     content["standard_deviations"] = {name.replace(" ", "_"): value for name, value in rig.sigma.items()}
     # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    file.writeComment(OURS)
+    file.writeComment("x_right = R x_left + T, square in metres; board in inner corners; residuals in pixels RMS")
     _store(file, content)
     return str(file.releaseAndGetString())
 
