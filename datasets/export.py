@@ -17,6 +17,7 @@ from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotation
+from rille.stages.geometry.lattice import Lattice
 
 Materialise = Callable[[Source], Bundle]
 
@@ -82,8 +83,7 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
     for frame in sorted({*pairs} - {*sequence.lost}):
         if sequence.truth_disparity is not None:
             _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
-        if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
-            _write_dem(sequence, folder, frame, materialise)
+        _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
     text = Path(__file__).with_name(README).read_text(encoding="utf-8")
     text = text.format(
@@ -136,21 +136,13 @@ def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:
 
 
 def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materialise) -> None:
-    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size."""
-    assert sequence.truth is not None
-    assert sequence.truth_dem is not None
-    assert sequence.evaluation_window is not None
+    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size, where it is known."""
+    T_truth_left = None if sequence.truth is None else sequence.truth[frame]
+    if sequence.truth_dem is None or T_truth_left is None or sequence.evaluation_window is None:
+        return
     cell = float(sequence.defaults.get("locus.cell_size", 0.001))
     x_min, y_min, x_max, y_max = (round(v / cell) for v in sequence.evaluation_window)
-    lattice: dict[str, Any] = {
-        "x0": x_min * cell,
-        "y0": y_max * cell,
-        "cell": cell,
-        "rows": y_max - y_min + 1,
-        "cols": x_max - x_min + 1,
-    }
-    T_truth_left = sequence.truth[frame]
-    assert T_truth_left is not None  # only a simulated sequence has a DEM, and its poses have no gap
+    lattice = Lattice.at(x_min, y_max, cell, y_max - y_min + 1, x_max - x_min + 1).to_dict()
     local = RigidTransform(level_rotation(T_truth_left.rotation[2]), np.zeros(3))
     T_truth_local = T_truth_left @ local.inverse()
     truth = materialise(sequence.truth_dem(lattice, T_truth_local, (frame,)))

@@ -23,6 +23,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -134,7 +135,7 @@ class TimedPositions:
 
 
 def read_positions(
-    path: Path, format: str, columns: Mapping[str, str | int], unit: float | None = None
+    path: Path, format: str, columns: Mapping[Any, str | int], unit: float | None = None
 ) -> TimedPositions | None:
     """Positions of a table without rotations; None where the file holds poses.
 

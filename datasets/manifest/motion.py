@@ -203,8 +203,7 @@ class MotionReader:
 
     def truth(self, section: Truth) -> None:
         """Poses of each pair, or positions alone with their own times."""
-        columns = {str(meaning): column for meaning, column in section.columns.items()}
-        alone = read_positions(self.root / section.file, section.format, columns, section.unit)
+        alone = read_positions(self.root / section.file, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
@@ -248,10 +247,9 @@ class MotionReader:
             They or the pairs have no times, and they are not one a pair.
         """
         self.warn(found.warnings)
-        rows = found.positions
         if found.times is not None and self.sequence.times is not None:
-            return rows, tuple(t + section.time_offset for t in found.times)
-        rows = tuple(self.arrived(rows))
+            return found.positions, tuple(t + section.time_offset for t in found.times)
+        rows = tuple(self.arrived(found.positions))
         if len(rows) != len(self.pairs):
             text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
             remedy = "give one a pair, or times of both ([times] of the pairs)"
@@ -266,8 +264,7 @@ class MotionReader:
         InputError
             The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
         """
-        columns = {str(meaning): column for meaning, column in section.columns.items()}
-        found = read_positions(self.root / section.file, "auto", columns, section.unit)
+        found = read_positions(self.root / section.file, "auto", section.columns, section.unit)
         if found is None:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
