@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
+from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
@@ -467,7 +468,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
 
     limits: dict[str, Any] = {}
     if isinstance(vehicle, str | Path):
-        read = config.read_toml(Path(vehicle))
+        read = read_toml(Path(vehicle), "configuration")
         limits = read.get("vehicle", read)
     elif vehicle is not None:
         check_sections({"vehicle": vehicle})
@@ -623,8 +624,8 @@ def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset
         about = next(array for array in stage.outputs if array.matches(name))
         attrs = {"units": about.unit, "long_name": about.long_name}
         variables[name] = (about.dims, np.asarray(values), attrs)
-    places = {} if lattice is None else coordinates(lattice, str(result.meta.get("frame", "local")))
+    on_it = lattice is not None and any(list(dims) == DIMS for dims, _, _ in variables.values())
+    places = coordinates(lattice, str(result.meta.get("frame", "local"))) if lattice is not None and on_it else {}
     coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
     plain = {k: v for k, v in result.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
-    kept = coords if lattice is not None and any(list(v[0]) == DIMS for v in variables.values()) else {}
-    return xarray.Dataset(variables, kept, {**plain, **_carried(result.meta, settings)})
+    return xarray.Dataset(variables, coords, {**plain, **_carried(result.meta, settings)})

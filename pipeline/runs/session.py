@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
+from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
@@ -80,10 +81,10 @@ class Settled:
 
 def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the user has set, by section: of the sequence, and of the stages."""
-    read = configuration.read_toml(options.config) if options.config else {}
+    given = read_toml(options.config, "configuration") if options.config else {}
     # Over the file: --set is said now, --config may be old.
-    configuration.merge(read, configuration.parse_assignments(options.assignments))
-    return configuration.split_dataset(read)
+    configuration.merge(given, configuration.parse_assignments(options.assignments))
+    return configuration.split_dataset(given)
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:
