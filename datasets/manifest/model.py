@@ -446,14 +446,6 @@ class Manifest(Table):
             raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
         return self
 
-    @model_validator(mode="before")
-    @classmethod
-    def _notes_in_a_table(cls, value: Any) -> Any:
-        """``notes`` may stand last, as ``[notes]`` with ``text = [...]``, where a bare key would join another table."""
-        if isinstance(value, dict) and isinstance(value.get("notes"), dict) and set(value["notes"]) == {"text"}:
-            return value | {"notes": value["notes"]["text"]}
-        return value
-
 
 def read_manifest(path: Path) -> Manifest:
     """Manifest of a TOML file.

@@ -69,10 +69,8 @@ max_step = 0.05
 [defaults]
 locus.cell_size = 0.02
 "keyframes.stride" = 1
-[notes]
-text = ["dusty"]
 """
-    s = opened(write_sequence(tmp_path, text, head='name = "dune"'))
+    s = opened(write_sequence(tmp_path, text, head='name = "dune"\nnotes = ["dusty"]'))
     assert (s.name, s.times, s.notes) == ("dune", (0.0, 0.25, 0.5), ("dusty",))
     assert s.pitch == pytest.approx(math.radians(20))
     assert s.vehicle is not None
