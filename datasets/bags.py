@@ -13,6 +13,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -105,7 +106,7 @@ def open_bag(
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
         there = [_images(reader, path, topic) for topic in chosen]
-        both, warnings = _joined(path, chosen, (there[0], there[1]), tolerance)
+        both, warnings = _joined(path, chosen, there, tolerance)
         stamps = both[0]
         taken = {c: [of[stamp] for stamp in k] for c, of, k in zip(CAMERAS, there, both, strict=True)}
         sizes = sizes_of((taken["left"][0].size, taken["right"][0].size))
@@ -193,10 +194,7 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
 
 
 def _joined(
-    path: Path,
-    topics: tuple[str, str],
-    taken: tuple[Mapping[int, TakenImage], Mapping[int, TakenImage]],
-    tolerance: float | None,
+    path: Path, topics: tuple[str, str], taken: Sequence_[Mapping[int, TakenImage]], tolerance: float | None
 ) -> tuple[tuple[list[int], list[int]], list[str]]:
     """Stamps of the left and of the right images of all pairs, in order, and what is left out."""
     left, right = sorted(taken[0]), sorted(taken[1])

@@ -397,9 +397,8 @@ class World(Table):
         if len(missing) in (1, 2):
             raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
         if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
-            raise ValueError(
-                f"origin = {list(self.origin)} looks like degrees: give easting, northing and height in {self.crs}, m"
-            )
+            text = f"origin = {list(self.origin)} looks like degrees"
+            raise ValueError(f"{text}: give easting, northing and height in {self.crs}, metres")
         return self
 
     @property
