@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text
-from rille.pipeline.steps import StereoSequence, assignments, check_place
+from rille.pipeline.steps import StereoSequence, assignments, place_of
 from rille.stages.core.errors import InputError, RilleError
 
 if TYPE_CHECKING:
@@ -86,8 +86,7 @@ def reconstruct(
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
-    if not isinstance(seq, StereoSequence):
-        check_place(seq)
+    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq)
     options = Options(
         assignments=tuple(assignments(settings)),
         frames=frames,
@@ -96,7 +95,7 @@ def reconstruct(
         cache=None if cache is None else str(cache),
         quiet=quiet,
     )
-    result = session.perform(seq.source if isinstance(seq, StereoSequence) else str(seq), options)
+    result = session.perform(given, options)
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())

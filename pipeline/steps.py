@@ -164,18 +164,18 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     >>> len(sequence), sequence[0].left.dims
     (9, ('row', 'col'))
     """
-    check_place(path)
     words = assignments(settings)
-    opened = registry.open_sequence(str(path), settings)
+    opened = registry.open_sequence(place_of(path), settings)
     said = (word for one in words for word in ("--set", one))
     return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
 
 
-def check_place(path: object) -> None:
-    """Refuse what can be no name or path of a sequence."""
+def place_of(path: object) -> str:
+    """Name or path of a sequence, as a command line has it; what can be none is refused."""
     if not isinstance(path, str | Path):
         text = f"a {type(path).__name__} is no sequence"
         raise InputError("RIL-970", text, remedy="give a name, a path, or what rille.open returns")
+    return str(path)
 
 
 def check_sections(settings: Mapping[str, object]) -> None:

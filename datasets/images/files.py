@@ -290,10 +290,9 @@ class Digests:
         self._known: dict[str, str] = {}
         with suppress(OSError):  # that of a shared cache may be its owner's alone
             if memory is not None and memory.is_file():
-                for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-                    digest, _, key = line.partition(" ")
-                    if len(digest) == 64:
-                        self._known[key] = digest
+                lines = memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+                parts = (line.partition(" ") for line in lines)
+                self._known = {key: digest for digest, _, key in parts if len(digest) == 64}
 
     def whole(self, path: Path) -> bool:
         """Whether an image file may be taken; one that somebody still writes may not."""

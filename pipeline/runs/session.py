@@ -83,8 +83,7 @@ def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the user has set, by section: of the sequence, and of the stages."""
     given = read_toml(options.config, "configuration") if options.config else {}
     # Over the file: --set is said now, --config may be old.
-    configuration.merge(given, configuration.parse_assignments(options.assignments))
-    return configuration.split_dataset(given)
+    return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:

@@ -108,7 +108,13 @@ def calibrate(
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
-    boards = find_boards(pairing.pair_up(*_files(left, right)), given)
+    pictures = _files(left, right)
+    try:
+        pairs = pairing.pair_up(*pictures)
+    except InputError as error:  # its remedies are keys of a manifest
+        remedy = "give both pictures of a pair one name or number, each side in a folder or glob of its own"
+        raise InputError(error.code, error.message, remedy=remedy) from error
+    boards = find_boards(pairs, given)
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
