@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FORMS = re.compile(
-    r"((EPSG|ESRI|IAU_\d+|IGNF|OGC)|urn:ogc:def:crs:EPSG:):|\+|\{"
-    r"|(PROJ|PROJECTED|GEOG|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\[",
-    re.IGNORECASE,
+    r"(?i)(EPSG|ESRI|IAU_\d+|IGNF|OGC|urn:ogc:def:crs:EPSG:):|[+{]"
+    r"|(PROJ|PROJECTED|GEOG|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
 )
 """How a CRS begins which GDAL does not look for in a file of that name."""
 
