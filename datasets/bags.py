@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,6 +33,7 @@ from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
 from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
+from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
@@ -55,12 +57,14 @@ Used = TypeVar("Used")
 
 @dataclass(frozen=True)
 class TakenImage:
-    """One image message: when it was recorded, its digest, and width, height and bits of its image."""
+    """One image message: when it was recorded, its digest, width, height and bits of its image, and the frame of its
+    camera; whether its driver has ``stamped`` it."""
 
     at: int
     sha256: str
     size: Header
     frame: str
+    stamped: bool
 
 
 def is_bag(path: Path) -> bool:
@@ -102,7 +106,7 @@ def open_bag(
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
         there = [_images(reader, path, topic) for topic in chosen]
-        both, warnings = _joined(path, chosen, (there[0], there[1]), tolerance)
+        both, warnings = _joined(path, chosen, there, tolerance)
         stamps = both[0]
         taken = {c: [of[stamp] for stamp in k] for c, of, k in zip(CAMERAS, there, both, strict=True)}
         sizes = sizes_of((taken["left"][0].size, taken["right"][0].size))
@@ -170,17 +174,19 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         yield at, data, reader.deserialize(data, connection.msgtype)
 
 
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+def _stamp(message: Any, at: int) -> int:
+    """Time stamp of a message, ns; that of its recording, ``at``, where its driver has not set one."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec) or at
 
 
 def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     """Images of a topic by their stamp, ns."""
     found: dict[int, TakenImage] = {}
     for at, data, message in _messages(reader, topic):
-        stamp = _stamp(message)
+        stamp = _stamp(message, at)
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
-        taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id)
+        stamped = bool(message.header.stamp.sec or message.header.stamp.nanosec)
+        taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id, stamped)
         if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
             text = f"{path}: two images of {topic} have the stamp {stamp}"
             raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
@@ -188,7 +194,7 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
 
 
 def _joined(
-    path: Path, topics: tuple[str, str], taken: tuple[Collection[int], Collection[int]], tolerance: float | None
+    path: Path, topics: tuple[str, str], taken: Sequence_[Mapping[int, TakenImage]], tolerance: float | None
 ) -> tuple[tuple[list[int], list[int]], list[str]]:
     """Stamps of the left and of the right images of all pairs, in order, and what is left out."""
     left, right = sorted(taken[0]), sorted(taken[1])
@@ -200,7 +206,12 @@ def _joined(
         )
         raise InputError("RIL-947", text, remedy="synchronise the cameras, or state images.tolerance (s) in a manifest")
     both = [left[i] for i, _ in joined.places], [right[j] for _, j in joined.places]
-    return both, joined.lines("RIL-948")
+    lines = joined.lines("RIL-948")
+    for topic, of in zip(topics, taken, strict=True):
+        if unstamped := sum(not image.stamped for image in of.values()):
+            text = f"{path}: {count(unstamped, 'image')} of {topic} without header.stamp: the time of recording counts"
+            lines.append(warning("RIL-994", text))
+    return both, lines
 
 
 # -- cameras -----------------------------------------------------------------------------------------------------------
@@ -289,7 +300,7 @@ def _movement(
         """
         topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
         # By stamp, for drivers repeat messages.
-        messages = {_stamp(m): m for topic in topics[:1] for _, _, m in _messages(reader, topic)}
+        messages = {_stamp(m, at): m for topic in topics[:1] for at, _, m in _messages(reader, topic)}
         if len(topics) > 1 or (topics and not messages):
             warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
         if len(topics) != 1 or not messages:

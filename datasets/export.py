@@ -17,6 +17,7 @@ from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotation
+from rille.stages.geometry.lattice import Lattice
 
 Materialise = Callable[[Source], Bundle]
 
@@ -24,16 +25,15 @@ README = "export_readme.txt"
 """File beside this module: what the folder says of itself, with places for the sequence's name, size and notes."""
 
 
-def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs: Iterable[int] | None = None) -> Path:
+def export(sequence: Sequence, directory: Path, materialise: Materialise) -> Path:
     """Write a sequence to a folder, wholly or not at all; frames without a pair of images are left out.
 
     Parameters
     ----------
     sequence : what to write.
     directory : folder to make; it must not exist yet, or be empty.
-    materialise : gives the arrays of a source (from a cache, or by running its stage).
-    pairs : frames whose true disparity and DEM are written, where the sequence has them; default: the basic pairs by
-        the sequence's own stride.
+    materialise : gives the arrays of a source (from a cache, or by running its stage); also true disparity and DEM of
+        the basic pairs by the sequence's own stride, where it has them.
 
     Raises
     ------
@@ -46,9 +46,6 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         raise InputError("RIL-184", text, remedy="export a sequence without; this one is plain files already")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise InputError("RIL-165", f"{directory} exists, and is no empty folder", remedy="name another")
-    chosen = tuple(
-        range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1))) if pairs is None else pairs
-    )
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
         # Beside the folder to be made: a rename in one step needs the same file system.
@@ -57,7 +54,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
         text = f"{directory} cannot be made: {error.strerror}"
         raise InputError("RIL-166", text, remedy="name another folder") from error
     try:
-        _write(sequence, part, materialise, chosen)
+        _write(sequence, part, materialise)
         # mkdtemp makes it readable for its owner alone.
         part.chmod(0o755)
         part.replace(directory)
@@ -67,7 +64,7 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise, pairs:
     return directory
 
 
-def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tuple[int, ...]) -> None:
+def _write(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
     frames = [k for k in range(sequence.frames) if k not in sequence.lost]
     for camera in CAMERAS:
         for k in frames:
@@ -79,11 +76,11 @@ def _write(sequence: Sequence, folder: Path, materialise: Materialise, pairs: tu
         _write_rows(folder / "poses.txt", [[math.nan] * 12 if pose is None else pose.to_list() for pose in poses])
     if sequence.times is not None:
         _write_rows(folder / "times.txt", [[sequence.times[k]] for k in frames])
-    for frame in sorted({*pairs} - {*sequence.lost}):
+    basic = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
+    for frame in sorted({*basic} - {*sequence.lost}):
         if sequence.truth_disparity is not None:
             _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
-        if sequence.truth_dem is not None and sequence.truth is not None and sequence.evaluation_window is not None:
-            _write_dem(sequence, folder, frame, materialise)
+        _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
     text = Path(__file__).with_name(README).read_text(encoding="utf-8")
     text = text.format(
@@ -136,21 +133,13 @@ def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:
 
 
 def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materialise) -> None:
-    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size."""
-    assert sequence.truth is not None
-    assert sequence.truth_dem is not None
-    assert sequence.evaluation_window is not None
+    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size, where it is known."""
+    T_truth_left = None if sequence.truth is None else sequence.truth[frame]
+    if sequence.truth_dem is None or T_truth_left is None or sequence.evaluation_window is None:
+        return
     cell = float(sequence.defaults.get("locus.cell_size", 0.001))
     x_min, y_min, x_max, y_max = (round(v / cell) for v in sequence.evaluation_window)
-    lattice: dict[str, Any] = {
-        "x0": x_min * cell,
-        "y0": y_max * cell,
-        "cell": cell,
-        "rows": y_max - y_min + 1,
-        "cols": x_max - x_min + 1,
-    }
-    T_truth_left = sequence.truth[frame]
-    assert T_truth_left is not None  # only a simulated sequence has a DEM, and its poses have no gap
+    lattice = Lattice.at(x_min, y_max, cell, y_max - y_min + 1, x_max - x_min + 1).to_dict()
     local = RigidTransform(level_rotation(T_truth_left.rotation[2]), np.zeros(3))
     T_truth_local = T_truth_left @ local.inverse()
     truth = materialise(sequence.truth_dem(lattice, T_truth_local, (frame,)))

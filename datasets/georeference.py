@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+FORMS = re.compile(
+    r"(?i)(EPSG|ESRI|IAU_\d+|IGNF|OGC|urn:ogc:def:crs:EPSG:):|[+{]"
+    r"|(PROJ|PROJECTED|GEOG|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
+)
+"""How a CRS begins which GDAL does not look for in a file of that name."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +57,20 @@ class Georeference:
 
 
 def _refuse_places(crs: str) -> None:
-    """Refuse, by a ValueError, what GDAL would read a CRS from: a file, or a pipe, or an address in the net."""
-    if "://" in crs or crs.startswith("/") or os.path.exists(crs):
-        raise ValueError("it names a file or an address: give the CRS itself, e.g. EPSG:32633")
+    """Refuse, by a ValueError, what GDAL might read a CRS from: a file, or a pipe, or an address in the net."""
+    if not FORMS.match(crs):
+        raise ValueError("no file or address is read: give the CRS itself, e.g. EPSG:32633")
+
+
+def are_degrees(crs: str, origin: Sequence[float]) -> bool:
+    """Whether an origin looks like longitude and latitude: near that of a CRS of a register no vehicle drives.
+
+    The origin of a CRS of one's own may lie anywhere.
+    """
+    from rasterio.crs import CRS
+
+    x, y = map(abs, origin[:2])
+    return 0 < min(x, y) <= 90 and max(x, y) <= 180 and CRS.from_user_input(crs).to_epsg() is not None
 
 
 def metric_crs(text: str) -> str:

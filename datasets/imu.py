@@ -19,7 +19,7 @@ import numpy as np
 
 from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, rows_of
-from rille.datasets.text.tables import TextTable, read_table
+from rille.datasets.text.tables import FORCES, RATES, TextTable, read_table
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
@@ -99,7 +99,7 @@ def read_imu(path: Path) -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
     Columns are recognised by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...); without names they must
-    be in this order. Names that say ``deg`` are converted, and so are times whose name states a unit.
+    be in this order. Values are converted by the units that the columns' names state.
 
     Raises
     ------
@@ -114,9 +114,7 @@ def read_imu(path: Path) -> ImuRecord:
     gyro, accelerometer = _columns(table)
     table, warnings = table.measured([0, *gyro, *accelerometer])
     times = times_of(table, 0)
-    rates, forces = table.numbers(gyro), table.numbers(accelerometer)
-    if any(re.search("deg|dps|\N{DEGREE SIGN}", table.header[k]) for k in gyro if table.header):
-        rates = np.deg2rad(rates)
+    rates, forces = table.measures(gyro, RATES), table.measures(accelerometer, FORCES)
     # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
     _possible(rates, 200.0, "rad/s", table)
     # m/s^2; accelerometers for shocks reach 500 times gravity

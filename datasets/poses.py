@@ -23,11 +23,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import of_two, seconds
+from rille.datasets.text import tables
+from rille.datasets.text.tables import TextTable, read_table, unitless
+from rille.datasets.text.times import UNITS, of_two, seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
@@ -70,9 +72,6 @@ DEGREES = re.compile(r"\b(lat|lon)")
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
 """Name of a column behind that of the whole seconds, as ROS stamps messages."""
 
-TIME_UNIT = re.compile(r"[\[(_ ](s|ms|us|ns)[\])]?$")
-"""At the end of the name of a column of times."""
-
 
 @dataclass(frozen=True)
 class TimedPoses:
@@ -92,13 +91,14 @@ class TimedPoses:
     warnings: tuple[str, ...] = ()
 
 
-def read_poses(path: Path, format: str = "auto") -> TimedPoses:
+def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> TimedPoses:
     """Poses of a file (forms: see module).
 
     Parameters
     ----------
     format : one of the forms; ``auto`` takes the columns' names where there are any, else 12 or 16 numbers a row for
         ``kitti``, commas for ``euroc`` and blanks for ``tum``.
+    unit : m; length of one unit of the file; None: as the names of its columns say, else 1.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     table = read_table(path, "pose file")
     meant = _meanings(table)
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
-        return TimedPoses(None, _matrices(table), table.name)
+        return TimedPoses(None, _matrices(table, 1.0 if unit is None else unit), table.name)
     columns = _columns(table, format, meant)
     warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
@@ -118,7 +118,8 @@ def read_poses(path: Path, format: str = "auto") -> TimedPoses:
     times = times_of(table, columns["time"]) if "time" in columns else None
     rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
-    positions = np.hstack([table.numbers([columns[axis]]) if axis in columns else nothing for axis in POSITION])
+    axes = [[columns[axis]] if axis in columns else [] for axis in POSITION]
+    positions = np.hstack([table.measures(axis, tables.LENGTHS, unit) if axis else nothing for axis in axes])
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
     return TimedPoses(times, poses, table.name, warnings)
 
@@ -133,13 +134,16 @@ class TimedPositions:
     warnings: tuple[str, ...]
 
 
-def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) -> TimedPositions | None:
+def read_positions(
+    path: Path, format: str, columns: Mapping[Any, str | int], unit: float | None = None
+) -> TimedPositions | None:
     """Positions of a table without rotations; None where the file holds poses.
 
     Parameters
     ----------
     columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, where the table's names do not say it; with any
         of them the table is one of positions.
+    unit : as for :func:`read_poses`.
 
     Raises
     ------
@@ -168,7 +172,7 @@ def read_positions(path: Path, format: str, columns: Mapping[str, str | int]) ->
     if "time" in meant:  # else rows are pairs
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
         times = times_of(table, meant["time"])
-    rows = table.numbers(placed)
+    rows = table.measures(placed, tables.LENGTHS, unit)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 
@@ -183,8 +187,8 @@ def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
 
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
-    said = TIME_UNIT.search(table.header[column]) if table.header else None
-    stamps, unit = table.text(column), said[1] if said else "auto"
+    stamps, stated = table.text(column), table.unit(column)
+    unit = stated if stated in UNITS else "auto"
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
         stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
@@ -197,7 +201,7 @@ def names_positions(table: TextTable) -> bool:
 
 def _column(table: TextTable, stated: str | int) -> int:
     """Number from 0 of a column that the manifest names or numbers."""
-    for names in (table.header, [name.partition(" [")[0] for name in table.header]):  # without its unit
+    for names in (table.header, list(map(unitless, table.header))):
         if isinstance(stated, str) and stated.strip().lower() in names:
             return names.index(stated.strip().lower())
     if isinstance(stated, int) and 1 <= stated <= table.columns:
@@ -207,11 +211,10 @@ def _column(table: TextTable, stated: str | int) -> int:
 
 
 def _meanings(table: TextTable) -> dict[str, int]:
-    """Columns by what their names mean; a unit in brackets or at the end is no part of a name."""
+    """Columns by what their names mean."""
     columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
-        bare = re.sub(r"[\[(].*?[\])]|[_ ](deg|rad|m|s|ns|us|ms)$", "", name).strip()
-        matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
+        matches = ((pattern.fullmatch(unitless(name)), meaning) for pattern, meaning in WORDS)
         meant = next((meaning(match) for match, meaning in matches if match), None)
         if meant is not None:
             columns.setdefault(meant, k)
@@ -253,16 +256,17 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
 
     known = [k for k, a in enumerate(ANGLES) if a in columns]
     values = np.zeros((len(table.rows), 3))
-    values[:, known] = table.numbers([columns[ANGLES[k]] for k in known])
-    units = {unit for k in known for unit in ("deg", "rad") if unit in table.header[columns[ANGLES[k]]]}
-    if not units and np.abs(values).max() > 2 * np.pi:
-        units = {"deg"}
-    if len(units) != 1:
-        text = f"{table.name}: roll, pitch and yaw have {'two units' if units else 'no unit'}"
+    places = [columns[ANGLES[k]] for k in known]
+    values[:, known] = table.measures(places, tables.ANGLES)
+    units = {table.unit(place) for place in places}
+    if units == {""} and np.abs(values).max() > 2 * np.pi:
+        values, units = np.deg2rad(values), {"deg"}
+    if len(units) != 1 or units == {""}:
+        text = f"{table.name}: roll, pitch and yaw have {'two units' if units - {''} else 'no unit'}"
         remedy = "name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
-    turns = Rotation.from_euler("ZYX", values[:, ::-1], degrees=units == {"deg"})
+    turns = Rotation.from_euler("ZYX", values[:, ::-1])
     return np.asarray(turns.as_matrix(), dtype=np.float64)
 
 
@@ -282,12 +286,13 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
 
 
-def _matrices(table: TextTable) -> tuple[RigidTransform | None, ...]:
-    """Poses of rows of [R | t]."""
+def _matrices(table: TextTable, unit: float) -> tuple[RigidTransform | None, ...]:
+    """Poses of rows of [R | t], of which t is in units of ``unit`` m."""
     if table.columns not in (12, 16):
         text = f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose"
         raise InputError("RIL-267", text, remedy="give 12 numbers a line, or state the format")
     values = table.numbers(range(table.columns), gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
+    values[:, :, 3] *= unit
     return tuple(
         None if np.isnan(m).any() else rounded_pose(m, f"{table.name}, line {line}")
         for m, line in zip(values, table.lines, strict=True)

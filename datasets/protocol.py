@@ -159,6 +159,7 @@ class Sequence:
     notes : facts that the report repeats.
     warnings : what is suspicious but possible, one line each with the figure; a run prints them and goes on.
     parameters : the sequence's own settings by configuration section, all defaults filled.
+    opened : words of a command line that name it: what it was opened by, and options with settings from Python.
     simulation : of a vehicle that is driven, not recorded: its frames come about on the way.
     """
 
@@ -191,6 +192,7 @@ class Sequence:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     parameters: Mapping[str, Params] = field(default_factory=dict)
+    opened: tuple[str, ...] = field(default=(), compare=False)
     simulation: Simulation | None = None
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ import shlex
 import site
 import sysconfig
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
@@ -108,13 +109,12 @@ def open_sequence(
     if name_or_path == "mockup-loop":
         bed, rover = section("mockup", SetupParams, **preset), section("rover", RoverParams)
         _none_left(sections, name_or_path)
-        return mockup_loop(bed, rover, name_or_path)
+        return replace(mockup_loop(bed, rover, name_or_path), opened=(name_or_path,))
     knocked = section("misalign", MisalignParams)
     simulated = section("mockup", MockupParams, **preset) if name_or_path in BUILT_IN else None
     _none_left(sections, name_or_path)
-    if simulated is not None:
-        return misalign(mockup(simulated, name_or_path), knocked)
-    return misalign(_opened(name_or_path, digests or Digests()), knocked)
+    found = mockup(simulated, name_or_path) if simulated is not None else _opened(name_or_path, digests or Digests())
+    return replace(misalign(found, knocked), opened=(name_or_path,))
 
 
 def _opened(name_or_path: str, digests: Digests) -> Sequence:

@@ -14,11 +14,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import tomli_w
-
 from rille.datasets.text.reading import TABLE, read_lines, read_text
-from rille.pipeline.steps import StereoSequence, check_place, check_sections
-from rille.stages.core.errors import ConfigError, InputError, RilleError
+from rille.pipeline.steps import StereoSequence, assignments, place_of
+from rille.stages.core.errors import InputError, RilleError
 
 if TYPE_CHECKING:
     import xarray
@@ -88,9 +86,7 @@ def reconstruct(
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
-    if not isinstance(seq, StereoSequence):
-        check_place(seq)
-    opened, place = (seq.source, seq.place) if isinstance(seq, StereoSequence) else (str(seq), "")
+    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq)
     options = Options(
         assignments=tuple(assignments(settings)),
         frames=frames,
@@ -99,7 +95,7 @@ def reconstruct(
         cache=None if cache is None else str(cache),
         quiet=quiet,
     )
-    result = session.perform(opened, options, place=place)
+    result = session.perform(given, options)
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())
@@ -132,27 +128,6 @@ def reconstruct_many(
         except RilleError as error:
             ended.append(error)
     return ended
-
-
-def assignments(settings: Mapping[str, Settings]) -> list[str]:
-    """Return the same settings as assignments for ``--set``.
-
-    >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
-    ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
-    """
-    words = []
-    check_sections(settings)
-    for section, values in settings.items():
-        for name, value in values.items():
-            try:
-                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
-            except TypeError:
-                text = f"{section}.{name} = {value!r} is no value of TOML"
-                remedy = "give a number, a text, True or False, or a list of these; or leave it out"
-                raise ConfigError("RIL-866", text, remedy=remedy) from None
-            # Only a list has several lines: the line feed of a text is escaped.
-            words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
-    return words
 
 
 def open_run(path: str | Path, runs: str | Path = "runs") -> Run:

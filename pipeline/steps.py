@@ -23,16 +23,18 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import index, methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
 from rille.datasets import registry
 from rille.datasets.protocol import Sequence
+from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
@@ -54,12 +56,10 @@ class StereoSequence:
 
     Attributes
     ----------
-    place : what it was opened by.
     drawn : images that were read or rendered already, by label.
     """
 
     source: Sequence
-    place: str = field(default="", compare=False)
     drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -164,16 +164,18 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     >>> len(sequence), sequence[0].left.dims
     (9, ('row', 'col'))
     """
-    check_place(path)
-    check_sections(settings)
-    return StereoSequence(registry.open_sequence(str(path), settings), str(path))
+    words = assignments(settings)
+    opened = registry.open_sequence(place_of(path), settings)
+    said = (word for one in words for word in ("--set", one))
+    return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
 
 
-def check_place(path: object) -> None:
-    """Refuse what can be no name or path of a sequence."""
+def place_of(path: object) -> str:
+    """Name or path of a sequence, as a command line has it; what can be none is refused."""
     if not isinstance(path, str | Path):
         text = f"a {type(path).__name__} is no sequence"
         raise InputError("RIL-970", text, remedy="give a name, a path, or what rille.open returns")
+    return str(path)
 
 
 def check_sections(settings: Mapping[str, object]) -> None:
@@ -182,6 +184,27 @@ def check_sections(settings: Mapping[str, object]) -> None:
         if not isinstance(values, Mapping):
             text = f"{section}={values!r} is no section"
             raise ConfigError("RIL-861", text, remedy=f'give {section}={{"name": value}}')
+
+
+def assignments(settings: Mapping[str, Settings]) -> list[str]:
+    """Return the same settings as assignments for ``--set``.
+
+    >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
+    ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
+    """
+    words = []
+    check_sections(settings)
+    for section, values in settings.items():
+        for name, value in values.items():
+            try:
+                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
+            except TypeError:
+                text = f"{section}.{name} = {value!r} is no value of TOML"
+                remedy = "give a number, a text, True or False, or a list of these; or leave it out"
+                raise ConfigError("RIL-866", text, remedy=remedy) from None
+            # Only a list has several lines: the line feed of a text is escaped.
+            words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
+    return words
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
@@ -445,7 +468,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
 
     limits: dict[str, Any] = {}
     if isinstance(vehicle, str | Path):
-        read = config.read_toml(Path(vehicle))
+        read = read_toml(Path(vehicle), "configuration")
         limits = read.get("vehicle", read)
     elif vehicle is not None:
         check_sections({"vehicle": vehicle})
@@ -601,8 +624,8 @@ def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset
         about = next(array for array in stage.outputs if array.matches(name))
         attrs = {"units": about.unit, "long_name": about.long_name}
         variables[name] = (about.dims, np.asarray(values), attrs)
-    places = {} if lattice is None else coordinates(lattice, str(result.meta.get("frame", "local")))
+    on_it = lattice is not None and any(list(dims) == DIMS for dims, _, _ in variables.values())
+    places = coordinates(lattice, str(result.meta.get("frame", "local"))) if lattice is not None and on_it else {}
     coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
     plain = {k: v for k, v in result.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
-    kept = coords if lattice is not None and any(list(v[0]) == DIMS for v in variables.values()) else {}
-    return xarray.Dataset(variables, kept, {**plain, **_carried(result.meta, settings)})
+    return xarray.Dataset(variables, coords, {**plain, **_carried(result.meta, settings)})

@@ -23,7 +23,7 @@ from rille.datasets.facts import ImageFacts
 from rille.datasets.images.headers import Header, opened, orientation, read_header
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
-from rille.datasets.text.reading import open_regular, read_bytes
+from rille.datasets.text.reading import mark, open_regular, read_bytes
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.levels import Levels, spread, swapped
@@ -272,7 +272,7 @@ def _header(path: Path) -> Header:
 
 
 class Digests:
-    """SHA-256 of files, remembered by path, size, inode, and times of modification and of change in ns.
+    """SHA-256 of files, remembered by path, and by inode, size and times.
 
     Where a file for it is given, each new digest is appended there as a line, the digest first and the path last: it is
     only a memo, so that a line that does not parse is passed over, and one that cannot be written is left out.
@@ -290,10 +290,9 @@ class Digests:
         self._known: dict[str, str] = {}
         with suppress(OSError):  # that of a shared cache may be its owner's alone
             if memory is not None and memory.is_file():
-                for line in memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-                    digest, _, key = line.partition(" ")
-                    if len(digest) == 64:
-                        self._known[key] = digest
+                lines = memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+                parts = (line.partition(" ") for line in lines)
+                self._known = {key: digest for digest, _, key in parts if len(digest) == 64}
 
     def whole(self, path: Path) -> bool:
         """Whether an image file may be taken; one that somebody still writes may not."""
@@ -305,8 +304,7 @@ class Digests:
             status = path.stat()
         except OSError as error:
             raise InputError("RIL-175", f"{path} cannot be read: {error.strerror}", remedy="check the path") from error
-        # No call can set the time of change: a file that was written anew with its old times has another.
-        key = f"{status.st_size} {status.st_ino} {status.st_mtime_ns} {status.st_ctime_ns} {path.resolve()}"
+        key = f"{mark(status)} {path.resolve()}"
         if key not in self._known:
             with open_regular(path, "image", MOST_BYTES) as file:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()

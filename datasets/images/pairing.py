@@ -296,7 +296,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
         numbers = re.findall(r"\d+", path.stem)
         if rule == "number" and not numbers:
             text = f"{path} has no number in its name and no partner of its name"
-            remedy = 'say how images are paired: images.pair = "order", or narrow the patterns'
+            remedy = 'rename the images, or narrow the patterns; a manifest may take them by images.pair = "order"'
             raise InputError("RIL-257", text, remedy=remedy)
         key = str(int(numbers[-1])) if rule == "number" else without_side(path.stem, side)
         if key in by_key:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from rille.datasets.georeference import Georeference, metric_crs
+from rille.datasets.georeference import Georeference, are_degrees, metric_crs
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.validation import TAG, validated
 from rille.stages.core.declare import Params
@@ -240,26 +240,45 @@ class Times(Table):
         return self
 
 
-class PoseFile(Table):
-    """Base of ``[odometry]`` and ``[truth]``: poses of the left camera or of a body that carries it.
+class Recorded(Table):
+    """Base of what a sensor or another program has written down.
+
+    Attributes
+    ----------
+    file : table of it.
+    time_offset : s; added to the file's times so that they are those of the images.
+    """
+
+    file: str
+    time_offset: float = 0.0
+
+
+class Poses(Recorded):
+    """Base of poses of the left camera or of a body that carries it.
 
     Attributes
     ----------
     file : poses, one a pair, or with times.
     format : kitti 3 x 4, tum, euroc or csv.
     T_body_left : rows of [R | t], m: from the left camera's frame to the body's whose poses the file has.
-    unit : m; length of one unit of the file, 0.001 where it says mm.
     max_gap : s; poses are interpolated over no longer gap.
-    time_offset : s; added to the file's times so that they are those of the images.
+    """
+
+    format: PoseFormat = "auto"
+    T_body_left: Pose | None = None
+    max_gap: float = Field(default=0.5, gt=0)
+
+
+class PoseFile(Poses):
+    """Base of ``[odometry]`` and ``[truth]``.
+
+    Attributes
+    ----------
+    unit : m; length of one unit of the file, 0.001 where it says mm; by default as its columns' names say, else 1.
     source : words: where the poses come from.
     """
 
-    file: str
-    format: PoseFormat = "auto"
-    T_body_left: Pose | None = None
-    unit: float = Field(default=1.0, gt=0)
-    max_gap: float = Field(default=0.5, gt=0)
-    time_offset: float = 0.0
+    unit: float | None = Field(default=None, gt=0)
     source: str = ""
 
 
@@ -283,7 +302,7 @@ class Odometry(PoseFile):
         return self
 
 
-class PositionFile(Table):
+class PositionFile(Recorded):
     """``[positions]``: where an antenna (GNSS) or a prism was; the trajectory is adjusted to them.
 
     Attributes
@@ -292,16 +311,14 @@ class PositionFile(Table):
     sigma : m; standard deviation of each coordinate, or of x, y and z.
     lever_arm : m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead.
     columns : names or numbers (from 1) of the columns, as for truth; names that are clear need none.
-    unit : m; length of one unit of the file.
+    unit : m; length of one unit of the file; by default as its columns' names say, else 1.
     time_offset : s; added to the file's times so that they are those of the images; what is left of it is estimated.
     """
 
-    file: str
     sigma: Deviation | tuple[Deviation, Deviation, Deviation]
     lever_arm: Vector = (0.0, 0.0, 0.0)
     columns: Columns = Field(default={})
-    unit: float = Field(default=1.0, gt=0)
-    time_offset: float = 0.0
+    unit: float | None = Field(default=None, gt=0)
 
 
 class Truth(PoseFile):
@@ -319,13 +336,12 @@ class Truth(PoseFile):
     lever_arm: Vector | None = None
 
 
-class Attitude(Table):
+class Attitude(Poses):
     """``[attitude]``: rotation from a sensor.
 
     Attributes
     ----------
     file : table of time and roll, pitch, yaw or a quaternion; or poses, of which R is taken.
-    format : as for poses.
     T_body_left : rows of [R | t]: from the left camera's frame to the sensor's.
     up : direction of up in the sensor's reference; none: not used as such.
     sigma_deg : degrees; standard deviation of the rotation from frame to frame and of up; with it the trajectory is
@@ -334,16 +350,11 @@ class Attitude(Table):
     time_offset : s; added to the file's times so that they are those of the images.
     """
 
-    file: str
-    format: PoseFormat = "auto"
-    T_body_left: Pose | None = None
     up: Direction | None = None
     sigma_deg: Deviation | None = None
-    max_gap: float = Field(default=0.5, gt=0)
-    time_offset: float = 0.0
 
 
-class Imu(Table):
+class Imu(Recorded):
     """``[imu]``: angular rates and accelerations.
 
     Attributes
@@ -354,10 +365,8 @@ class Imu(Table):
     time_offset : s; added to the file's times so that they are those of the images.
     """
 
-    file: str
     T_imu_left: Pose
     sigma_deg: Deviation | None = None
-    time_offset: float = 0.0
 
 
 class World(Table):
@@ -387,6 +396,9 @@ class World(Table):
         missing = [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
         if len(missing) in (1, 2):
             raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
+        if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
+            text = f"origin = {list(self.origin)} looks like degrees"
+            raise ValueError(f"{text}: give easting, northing and height in {self.crs}, metres")
         return self
 
     @property
@@ -432,14 +444,6 @@ class Manifest(Table):
         if self.attitude is not None and self.imu is not None:
             raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
         return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _notes_in_a_table(cls, value: Any) -> Any:
-        """``notes`` may stand last, as ``[notes]`` with ``text = [...]``, where a bare key would join another table."""
-        if isinstance(value, dict) and isinstance(value.get("notes"), dict) and set(value["notes"]) == {"text"}:
-            return value | {"notes": value["notes"]["text"]}
-        return value
 
 
 def read_manifest(path: Path) -> Manifest:

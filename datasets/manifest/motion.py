@@ -20,8 +20,8 @@ from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, Pos
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.text.reading import read_lines
-from rille.datasets.text.tables import NUMBER, split
-from rille.datasets.text.times import of_two, seconds, undated
+from rille.datasets.text.tables import NUMBER, split, unit_of
+from rille.datasets.text.times import UNITS, of_two, seconds, undated
 from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -30,6 +30,9 @@ Row = TypeVar("Row")
 
 TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
 """Seconds since 1970 and nanoseconds; where the second is a number of frames, a time changes by nothing that counts."""
+
+TIME = re.compile("time|stamp", re.IGNORECASE)
+"""In the title of a column of times."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
@@ -100,15 +103,17 @@ class MotionReader:
         if section.rate_hz is not None:
             return tuple(k / section.rate_hz for k in range(len(self.pairs)))
         path = self.root / (section.file or "")
-        stamps = self.stamps_of_names(section.unit) if section.names else self.stamps_of_file(path)
+        named, stamps = self.stamps_of_names(section.unit) if section.names else self.stamps_of_file(path)
+        unit = named if section.unit == "auto" else section.unit
         what = "the image names" if section.names else str(path)
         known = [k for k, stamp in enumerate(stamps) if stamp is not None]
         rows = [stamp for stamp in stamps if stamp is not None]
-        times = seconds([t for t, _ in rows], what, unit=section.unit, lines=[line for _, line in rows])
+        times = seconds([t for t, _ in rows], what, unit=unit, lines=[line for _, line in rows])
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
-    def stamps_of_names(self, unit: str) -> list[tuple[str, int]]:
-        """The time stamp in each left image's name, a date, one since 1970 or its last number; and the pair's place."""
+    def stamps_of_names(self, unit: str) -> tuple[str, list[tuple[str, int]]]:
+        """The ``unit``, and the time stamp in each left image's name, a date, one since 1970 or its last number, with
+        the pair's place."""
         stems = [undated(pair.left.stem) for pair in self.pairs]
         stamps = [stamp_of(stem) or ["", *re.findall(r"\d+(?:\.\d+)?", stem)][-1] for stem in stems]
         wrong = stamps.index("") if "" in stamps else 0
@@ -117,10 +122,11 @@ class MotionReader:
             text = f"{self.name}: times.names: {self.pairs[wrong].left} has no number in its name, or one that counts"
             remedy = 'give times.file or times.rate_hz; or, where the names are seconds, times.unit = "s"'
             raise InputError("RIL-227", text, remedy=remedy)
-        return [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
+        return unit, [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
 
-    def stamps_of_file(self, path: Path) -> Sequence[tuple[str, int] | None]:
-        """Time stamp of each pair as text, and the line that it stands in."""
+    def stamps_of_file(self, path: Path) -> tuple[str, list[tuple[str, int] | None]]:
+        """Unit that the column's name states, or ``auto``; time stamp of each pair as text, and the line that it stands
+        in."""
         lines = read_lines(path, "times")
         if self.growing and not path.read_bytes().endswith(b"\n"):  # whoever writes it has not come to the line's end
             del lines[-1:]
@@ -135,26 +141,28 @@ class MotionReader:
                 header = cells or header
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
-            stated = [cell for title, cell in titles.items() if re.search("time|stamp", title, re.I)]
+            stated = [cell for title, cell in titles.items() if TIME.search(title)]
             found.append([cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]])
             at.append(k)
             images = images or bool(names)
             by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(at) - 1 for cell in names or cells[1:2]}
         if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells in found):
             found = [[of_two(*cells)] for cells in found]
+        units = [unit_of(title) for title in header if TIME.search(title)]
+        unit = next((stated for stated in units if stated in UNITS), "auto")
         column = int(_counts(found))
         rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
         # Tables may list more images than there are pairs, in any order: names decide where all are found.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
-            return [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
+            return unit, [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
         rows = list(self.arrived(rows))
         if images or len(rows) not in self.counts():
             more = f", none of {absent}" if by_name else ""
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
             raise IncompleteError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
-        return self.one_a_pair(rows)
+        return unit, self.one_a_pair(rows)
 
     def counts(self) -> set[int]:
         """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
@@ -164,7 +172,7 @@ class MotionReader:
         """The rows without those for images that are still to come."""
         return rows[: len(self.pairs)] if self.growing else rows
 
-    def one_a_pair(self, rows: Sequence[Row]) -> Sequence[Row | None]:
+    def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None]:
         """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
         remaining = iter(rows)
         partly = len(rows) < len(self.pairs)
@@ -173,15 +181,14 @@ class MotionReader:
     def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
         """T_reference_left of each pair from a file of poses of a body."""
         path = self.root / section.file
-        timed = read_poses(path, section.format)
+        timed = read_poses(path, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
         self.warn(timed.warnings)
-        unit = section.unit if isinstance(section, PoseFile) else 1.0
-        poses: Poses = tuple(p and RigidTransform(p.rotation, unit * p.translation) for p in timed.poses)
+        poses: Poses = timed.poses
         if timed.times is not None:
             if self.sequence.times is None:
                 text = f"{self.name}: the poses of {path} have times, but the pairs have none"
                 raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
-            moved = replace(timed, poses=poses, times=tuple(t + section.time_offset for t in timed.times))
+            moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
         elif len(self.arrived(poses)) in self.counts():
@@ -196,8 +203,7 @@ class MotionReader:
 
     def truth(self, section: Truth) -> None:
         """Poses of each pair, or positions alone with their own times."""
-        columns = {str(meaning): column for meaning, column in section.columns.items()}
-        alone = read_positions(self.root / section.file, section.format, columns)
+        alone = read_positions(self.root / section.file, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
@@ -241,10 +247,9 @@ class MotionReader:
             They or the pairs have no times, and they are not one a pair.
         """
         self.warn(found.warnings)
-        rows = tuple(tuple(section.unit * v for v in row) for row in found.positions)
         if found.times is not None and self.sequence.times is not None:
-            return rows, tuple(t + section.time_offset for t in found.times)
-        rows = tuple(self.arrived(rows))
+            return found.positions, tuple(t + section.time_offset for t in found.times)
+        rows = tuple(self.arrived(found.positions))
         if len(rows) != len(self.pairs):
             text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
             remedy = "give one a pair, or times of both ([times] of the pairs)"
@@ -259,8 +264,7 @@ class MotionReader:
         InputError
             The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
         """
-        columns = {str(meaning): column for meaning, column in section.columns.items()}
-        found = read_positions(self.root / section.file, "auto", columns)
+        found = read_positions(self.root / section.file, "auto", section.columns, section.unit)
         if found is None:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")

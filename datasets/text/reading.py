@@ -93,6 +93,11 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     raise InputError("RIL-139", f"{what} {path} is too large: {size}", remedy="check that it is the right file")
 
 
+def mark(status: os.stat_result) -> str:
+    """Inode, size and times of a file: they change with its content, for no call can set the time of change."""
+    return f"{status.st_ino:x}.{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ctime_ns:x}"
+
+
 def is_broken(path: str | Path) -> bool:
     """Whether a path is a link to something that is missing."""
     return os.path.islink(path) and not os.path.exists(path)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,9 +24,25 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
-UNITS = frozenset(("", "s", "ms", "us", "ns", "sec", "m", "mm", "cm", "km", "rad", "deg", "dps", "g", "px", "%"))
-OPERATOR = re.compile(r"[-/^*.\d \[\]()]+")
+LENGTHS: Mapping[str, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
+ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}
+RATES: Mapping[str, float] = {"rad s": 1.0, "deg s": ANGLES["deg"], "dps": ANGLES["deg"], **ANGLES}
+FORCES: Mapping[str, float] = {"m s": 1.0, "m s s": 1.0, "g": 9.80665}
+"""Units of a column, as :meth:`TextTable.unit` gives them, in metres, radians and seconds."""
+
+UNITS = frozenset(
+    ("", *LENGTHS, "rad", "deg", "dps", "g", "s", "ms", "us", "ns", "sec", "mg", "mdps", "mrad", "px", "%")
+)
+OPERATOR = re.compile(r"[-_/^*.\d \[\]()]+")
 """Words of a row of units, and what stands between and about them: ``[m s^-2]``."""
+
+SPELT = (("deg", "deg(rees?|s)|\N{DEGREE SIGN}"), ("rad", "rad(ians?|s)"), ("m", "met(er|re)s?"), ("ft", "feet|foot"))
+"""Symbols of units, and how else they are written."""
+
+STATED = re.compile(
+    r"[\[(](.*?)[\])]|[_ ]((?:[mun]?s|[mck]?m|ft)(?:[_/]s2?)?$|(?:m?rad|deg|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
+)
+"""Unit in the name of a column: in brackets, or at its end; of turns also before the axis."""
 
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
@@ -45,6 +61,10 @@ class TextTable:
     def columns(self) -> int:
         """How many columns each row has."""
         return len(self.rows[0])
+
+    def unit(self, column: int) -> str:
+        """Unit that the name of a column states (:func:`unit_of`); empty: none."""
+        return unit_of(self.header[column]) if self.header else ""
 
     def text(self, column: int) -> list[str]:
         """One column as it is written: exact, where a float would lose the last digits of a time stamp."""
@@ -68,6 +88,25 @@ class TextTable:
         text += f", the first in line {self.lines[int(missing.argmax())]}"
         return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
+    def measures(
+        self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None
+    ) -> NDArray[np.float64]:
+        """Columns as :meth:`numbers`, times ``unit``, or by default times what the unit in a column's name is.
+
+        Raises
+        ------
+        InputError
+            A cell is no number, or the unit in a name is none of the ``units``.
+        """
+        factors = []
+        for column in columns:
+            stated = self.unit(column)
+            if unit is None and stated and stated not in units:
+                text = f"{self.name}: the unit of column {self.header[column]!r} is none of it, or is not known"
+                raise InputError("RIL-995", text, remedy="convert it to m, rad, rad/s or m/s^2, and name it so")
+            factors.append(units.get(stated, 1.0) if unit is None else unit)
+        return self.numbers(columns) * factors
+
     def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
         """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` rows may be NaN as a whole.
 
@@ -84,6 +123,25 @@ class TextTable:
             text = f"{self.name}, line {self.lines[row]}: {cell!r} is not a finite number below {GREATEST:g}"
             raise InputError("RIL-284", text, remedy="correct or remove that line")
         return values
+
+
+def unit_of(name: str) -> str:
+    """Unit in the name of a column, its parts apart by blanks, without powers; empty: none that is known.
+
+    >>> unit_of("gyro_x [rad s^-1]")
+    'rad s'
+    """
+    stated = STATED.search(name.lower())
+    words = (stated[1] or stated[2] or "") if stated else ""
+    for symbol, spelt in SPELT:
+        words = re.sub(rf"(?<![a-z])({spelt})(?![a-z])", symbol, words)
+    parts = [part for part in OPERATOR.split(words) if part]
+    return " ".join(parts) if UNITS.issuperset(parts) else ""
+
+
+def unitless(name: str) -> str:
+    """The name of a column without its unit."""
+    return STATED.sub("", name).strip()
 
 
 def _number(cell: str) -> float:
@@ -123,7 +181,8 @@ def read_table(path: Path, what: str) -> TextTable:
         if not rows and not NUMBER.match(row[0]):
             text = text.lstrip("#%").strip()
             cells = split(text, separator, columns)
-            of_units = bool(names) and all(UNITS.issuperset(OPERATOR.split(cell.lower())) for cell in cells)
+            below = names and len(cells) == len(split(names, separator, columns))
+            of_units = below and all(UNITS.issuperset(OPERATOR.split(cell.lower())) for cell in cells)
             names, units = (names, cells) if of_units else (text, ())
             continue
         if rows and len(row) != columns:

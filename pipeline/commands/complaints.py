@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 
+from rille.pipeline.engine.plain import one_line
 from rille.pipeline.runs.options import FAILED, USAGE
 
 LONGEST_COMPLAINT = 1000
@@ -28,7 +29,7 @@ def complain(error: Exception, *, debug: bool = False) -> int:
 
 def print_error(code: str, words: str) -> None:
     """Print an error in one line of at most :data:`LONGEST_COMPLAINT` characters."""
-    line = " ".join(words.split())
+    line = one_line(words)
     if len(line) > LONGEST_COMPLAINT:  # of what a file holds, enough to find it
         line = f"{line[: LONGEST_COMPLAINT // 2]} ... {line[-LONGEST_COMPLAINT // 2 :]}"
     print(f"rille: error {code}: {line}", file=sys.stderr)

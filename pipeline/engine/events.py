@@ -99,8 +99,3 @@ def _lines(path: Path) -> list[dict[str, Any]]:
             with suppress(ValueError, RecursionError):
                 rows.append(json.loads(line.decode()))
     return rows
-
-
-def keys(path: Path) -> set[str]:
-    """Keys of all artifacts that the run of a ledger used: what clearing the cache must keep."""
-    return {str(row["key"]) for row in read(path) if row["status"] in ("computed", "cached") and "key" in row}

@@ -19,6 +19,7 @@ from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
 from rille.pipeline.engine.packages import version
+from rille.pipeline.engine.plain import one_line
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError
 
@@ -62,7 +63,7 @@ def compare(ours: Identity, probe: Path) -> None:
         probe.read_bytes()
         probe.with_name(f"{probe.name}-{uuid.uuid4().hex}").touch()
     except OSError as error:
-        text = f"does not share the cache {probe.parents[1]}: {' '.join(str(error).split())}"
+        text = f"does not share the cache {probe.parents[1]}: {one_line(error)}"
         raise ConfigError("RIL-523", text, remedy="give --cache a folder that all machines share") from error
 
 
@@ -85,7 +86,7 @@ def examine(client: Any, cache: Path) -> None:
             if isinstance(answer, ConfigError):
                 raise answer.at(name)
             if isinstance(answer, BaseException):
-                text = f"{name} cannot run Rille: {type(answer).__name__}: {' '.join(str(answer).split())[:200]}"
+                text = f"{name} cannot run Rille: {type(answer).__name__}: {one_line(answer)[:200]}"
                 remedy = "install the same version there, and start the workers with it"
                 raise ConfigError("RIL-520", text, remedy=remedy)
     finally:

@@ -152,9 +152,7 @@ ANEW = "/anew"
 
 def first_label(label: str) -> str:
     """The label of the task that was laid out first in the place of this one."""
-    while label.endswith(ANEW):
-        label = label.removesuffix(ANEW)
-    return label
+    return label.partition(ANEW)[0]
 
 
 @dataclass

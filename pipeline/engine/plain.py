@@ -46,12 +46,17 @@ def raw(stream: Any) -> Any:
 
 def warned(line: str) -> str:
     """A warning as it is printed: one that begins with a code (``RIL-680: ...``) shows it where an error would."""
-    return f"rille: warning{' ' if line.startswith('RIL-') else ': '}{' '.join(line.split())}"
+    return f"rille: warning{' ' if line.startswith('RIL-') else ': '}{one_line(line)}"
 
 
 def warn(line: str) -> None:
     """Print a warning on stderr."""
     print(warned(line), file=sys.stderr)
+
+
+def one_line(text: object) -> str:
+    """The text of something in one line, with single blanks."""
+    return " ".join(str(text).split())
 
 
 def brief(value: Any, most: int) -> str:

@@ -41,6 +41,9 @@ NO_PLACE = "give a raster that says itself where its cells are"
 TIFF = (b"II", b"MM")
 """How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
 
+OWN_TAGS = ("FRAME", "ERROR")
+"""Tags of the rasters that Rille writes: of a run, and of a comparison."""
+
 METRE = ("m", "metre", "metres", "meter", "meters")
 
 
@@ -176,22 +179,28 @@ def opened_raster(path: Path) -> Iterator[Any]:
             raise InputError("RIL-629", text, remedy=remedy) from error
 
 
-def read_raster(path: Path) -> DemFile:
+def read_raster(path: Path, holds: str = "elevation") -> DemFile:
     """First band of a GeoTIFF, or an ESRI ASCII grid.
+
+    Parameters
+    ----------
+    holds : name of the band in a raster of Rille's own.
 
     Raises
     ------
     InputError
-        It cannot be read, has no geotransform, or has another unit.
+        It cannot be read, has no geotransform, another unit, or holds something else.
     """
     with opened_raster(path) as file:
         _check_cells(path, file.shape)
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
-        if "red" in {band.name for band in file.colorinterp}:
-            remedy = "give an elevation model; rille localize takes images by --ortho"
-            raise InputError("RIL-636", f"{path} has colours, no elevations", remedy=remedy)
+        tags, coloured = file.tags(), "red" in {band.name for band in file.colorinterp}
+        if coloured or (file.descriptions[0] != holds and not tags.keys().isdisjoint(OWN_TAGS)):
+            text = f"{path} has {'colours' if coloured else file.descriptions[0]}, no {holds}"
+            remedy = "give an elevation model, of a run dem.tif; rille localize takes images by --ortho"
+            raise InputError("RIL-636", text, remedy=remedy)
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
-        crs, transform, unit, frame = file.crs, file.transform, file.units[0], file.tags().get("FRAME", "")
+        crs, transform, unit, frame = file.crs, file.transform, file.units[0], tags.get("FRAME", "")
     wkt = _checked_system(path, transform, crs)
     # Lengths of the cell's sides, not a and e: a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
@@ -317,7 +326,7 @@ def _of_run(path: Path) -> DemFile:
         remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
         raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
     dem, beside = read_raster(path / "dem.tif"), path / "dem_sigma.tif"
-    sigma = read_raster(beside).grid.values if beside.is_file() else None
+    sigma = read_raster(beside, "elevation_std").grid.values if beside.is_file() else None
     # Another model's, of other cells, is none of this one.
     sigma = sigma if sigma is not None and sigma.shape == dem.grid.values.shape else None
     return replace(dem, name=str(path), viewpoints=_cameras(path), sigma=sigma)
@@ -351,6 +360,20 @@ def _place(frames: str) -> Georeference | None:
     return None if stated is None else Georeference.from_dict(stated)
 
 
+def refuse_irregular(top: Path) -> None:
+    """Refuse a file or folder of a run that is, or holds, a link, a pipe or a device.
+
+    Raises
+    ------
+    InputError
+        It does; Rille writes none, and what a link leads to is no part of the run.
+    """
+    below = (Path(entry.path) for _, entries in Search().below(top, hidden=True) for entry in entries)
+    for path in (top, *below):
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            raise InputError("RIL-723", f"{path} is no regular file", remedy=OURS)
+
+
 def check_group(path: Path) -> None:
     """Refuse a zarr group that is not worth opening: axes or chunks longer than any that Rille writes, or pipes.
 
@@ -364,10 +387,7 @@ def check_group(path: Path) -> None:
     import zarr
     from zarr.storage import LocalStore
 
-    search = Search()
-    for entry in (entry for _, entries in search.below(path, hidden=True) for entry in entries):
-        if not (entry.is_file() or entry.is_dir()):
-            raise InputError("RIL-723", f"{entry.path} is no regular file", remedy=OURS)
+    refuse_irregular(path)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
         # Cells; coordinates are read whole even where nothing else is
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:

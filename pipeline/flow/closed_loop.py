@@ -331,12 +331,11 @@ class Drive:
 
     def _think(self, stop: Stop) -> Generator[Wait, Any, None]:
         """Plan the next leg by what is known at a stop, anew where a way turns out to be closed."""
-        given = {"risk": stop.risk, "far": stop.far, "ceiling": stop.ceiling, "before": self.planned}
-        given["driven"] = self.products.trajectory
-        known = {name: handle for name, handle in given.items() if handle is not None}
+        known = {"risk": stop.risk, "far": stop.far, "ceiling": stop.ceiling, "pose": self.poses[-1]}
         follows, label = "again", f"leg/{stop.index}"
         while follows == "again":
-            stop.leg = self._leg(label, self.memory, {}, pose=self.poses[-1], **known)
+            driven = self.products.trajectory
+            stop.leg = self._leg(label, self.memory, {}, before=self.planned, driven=driven, **known)
             leg = (yield stop.leg).meta
             where = None if leg["where"] is None else tuple(leg["where"])
             follows = self.memory.after(leg["verdict"], where)
@@ -351,7 +350,7 @@ class Drive:
             raise EndedError("stops", f"{count(stop.index + 1, 'stop')} and {left}")
         self.planned, stop.event = stop.leg, leg["reason"]
 
-    def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle) -> Handle:
+    def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle | None) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
         args |= {"closed": [list(p) for p in memory.closed]}
         return self.make.node(local_planner_stage, label, rig=self.pairs[0].rig, **args, **more, **inputs)

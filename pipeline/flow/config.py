@@ -11,14 +11,12 @@ import pkgutil
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 import tomli_w
 from pydantic import Field, create_model
 
-from rille.datasets.text import reading
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.declare import Params, Stage, declared
 from rille.stages.core.errors import ConfigError
@@ -155,11 +153,6 @@ def _toml_value(text: str) -> Any:
         return tomllib.loads(f"v = {text}")["v"]
     except (ValueError, RecursionError):  # also numbers of thousands of digits
         return text
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Configuration file to a nested mapping."""
-    return reading.read_toml(path, "configuration")
 
 
 def expand(dotted: Mapping[str, Any]) -> dict[str, Any]:

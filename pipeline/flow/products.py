@@ -5,27 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rille.pipeline.engine.graph import Handle
-from rille.stages.facts.calibration import OrientationFacts, RigFacts
-from rille.stages.facts.evaluation import (
-    AccuracyFacts,
-    AgreementFacts,
-    DemAccuracyFacts,
-    DriveCheckFacts,
-    JoinFacts,
-    MetricsFacts,
-    WindowFacts,
-)
-from rille.stages.facts.odometry import (
-    IntrinsicsFacts,
-    KeyframesFacts,
-    LoopFacts,
-    MovingFacts,
-    ResectFacts,
-    ScreeningFacts,
-    TrackFacts,
-    TrajectoryFacts,
-)
-from rille.stages.facts.terrain import AuditFacts, DemFacts, GroundFacts, MapFixFacts, MergeFacts, OverlapFacts
+from rille.stages.facts import calibration, evaluation, odometry, terrain
 
 
 @dataclass
@@ -39,11 +19,11 @@ class Stop:
 
     index: int
     frame: int
-    merged: Handle[MergeFacts] | None = None
+    merged: Handle[terrain.MergeFacts] | None = None
     risk: Handle | None = None
     far: Handle | None = None
     ceiling: Handle | None = None
-    trajectory: Handle[TrajectoryFacts] | None = None
+    trajectory: Handle[odometry.TrajectoryFacts] | None = None
     leg: Handle | None = None
     drive: Handle | None = None
     sense: Handle | None = None
@@ -63,8 +43,8 @@ class Driven:
     verdict: str = ""
     reason: str = ""
     place: Handle | None = None
-    fix: Handle[MapFixFacts] | None = None
-    check: Handle[DriveCheckFacts] | None = None
+    fix: Handle[terrain.MapFixFacts] | None = None
+    check: Handle[evaluation.DriveCheckFacts] | None = None
 
 
 @dataclass
@@ -78,39 +58,39 @@ class Products:
 
     images: dict[int, Handle] = field(default_factory=dict)
     undistorted: dict[int, Handle] = field(default_factory=dict)
-    screening: Handle[ScreeningFacts] | None = None
-    keyframes: Handle[KeyframesFacts] | None = None
-    orientations: dict[int, Handle[OrientationFacts]] = field(default_factory=dict)
-    rigs: dict[int, Handle[RigFacts]] = field(default_factory=dict)
+    screening: Handle[odometry.ScreeningFacts] | None = None
+    keyframes: Handle[odometry.KeyframesFacts] | None = None
+    orientations: dict[int, Handle[calibration.OrientationFacts]] = field(default_factory=dict)
+    rigs: dict[int, Handle[calibration.RigFacts]] = field(default_factory=dict)
     contradictions: list[Handle] = field(default_factory=list)
-    crosschecks: list[Handle[WindowFacts]] = field(default_factory=list)
-    crosscheck: Handle[JoinFacts] | None = None
-    agreement: Handle[AgreementFacts] | None = None
-    crosscheck_accuracy: Handle[AccuracyFacts] | None = None
+    crosschecks: list[Handle[evaluation.WindowFacts]] = field(default_factory=list)
+    crosscheck: Handle[evaluation.JoinFacts] | None = None
+    agreement: Handle[evaluation.AgreementFacts] | None = None
+    crosscheck_accuracy: Handle[evaluation.AccuracyFacts] | None = None
     disparity: dict[int, Handle] = field(default_factory=dict)
-    ground: dict[int, Handle[GroundFacts]] = field(default_factory=dict)
-    level: dict[int, Handle[GroundFacts]] = field(default_factory=dict)
-    local_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
+    ground: dict[int, Handle[terrain.GroundFacts]] = field(default_factory=dict)
+    level: dict[int, Handle[terrain.GroundFacts]] = field(default_factory=dict)
+    local_dem: dict[int, Handle[terrain.DemFacts]] = field(default_factory=dict)
     local_risk: dict[int, Handle] = field(default_factory=dict)
     local_path: dict[int, Handle] = field(default_factory=dict)
-    tracks: list[Handle[TrackFacts]] = field(default_factory=list)
-    resections: list[Handle[ResectFacts]] = field(default_factory=list)
-    intrinsics: Handle[IntrinsicsFacts] | None = None
-    moving: dict[int, Handle[MovingFacts]] = field(default_factory=dict)
-    world_dem: dict[int, Handle[DemFacts]] = field(default_factory=dict)
-    seams: dict[int, Handle[OverlapFacts]] = field(default_factory=dict)
-    overlap_audit: Handle[AuditFacts] | None = None
-    world_tiles: list[Handle[MergeFacts]] = field(default_factory=list)
-    loops: list[Handle[LoopFacts]] = field(default_factory=list)
-    chained: Handle[TrajectoryFacts] | None = None
-    trajectory: Handle[TrajectoryFacts] | None = None
+    tracks: list[Handle[odometry.TrackFacts]] = field(default_factory=list)
+    resections: list[Handle[odometry.ResectFacts]] = field(default_factory=list)
+    intrinsics: Handle[odometry.IntrinsicsFacts] | None = None
+    moving: dict[int, Handle[odometry.MovingFacts]] = field(default_factory=dict)
+    world_dem: dict[int, Handle[terrain.DemFacts]] = field(default_factory=dict)
+    seams: dict[int, Handle[terrain.OverlapFacts]] = field(default_factory=dict)
+    overlap_audit: Handle[terrain.AuditFacts] | None = None
+    world_tiles: list[Handle[terrain.MergeFacts]] = field(default_factory=list)
+    loops: list[Handle[odometry.LoopFacts]] = field(default_factory=list)
+    chained: Handle[odometry.TrajectoryFacts] | None = None
+    trajectory: Handle[odometry.TrajectoryFacts] | None = None
     world_risk: Handle | None = None
     world_path: Handle | None = None
-    accuracy: Handle[AccuracyFacts] | None = None
-    position_accuracy: Handle[AccuracyFacts] | None = None
-    disparity_accuracy: dict[int, Handle[MetricsFacts]] = field(default_factory=dict)
-    local_dem_accuracy: dict[int, Handle[DemAccuracyFacts]] = field(default_factory=dict)
-    dem_accuracy: Handle[DemAccuracyFacts] | None = None
+    accuracy: Handle[evaluation.AccuracyFacts] | None = None
+    position_accuracy: Handle[evaluation.AccuracyFacts] | None = None
+    disparity_accuracy: dict[int, Handle[evaluation.MetricsFacts]] = field(default_factory=dict)
+    local_dem_accuracy: dict[int, Handle[evaluation.DemAccuracyFacts]] = field(default_factory=dict)
+    dem_accuracy: Handle[evaluation.DemAccuracyFacts] | None = None
     truth_risk: Handle | None = None
-    path_check: Handle[MetricsFacts] | None = None
+    path_check: Handle[evaluation.MetricsFacts] | None = None
     drive: Driven | None = None

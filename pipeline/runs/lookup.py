@@ -139,4 +139,5 @@ def used(run: Path) -> set[str]:
         Its ledger is none, so that this is not known.
     """
     with reading(run):
-        return events.keys(run / LEDGER)
+        rows = (row for row in events.read(run / LEDGER) if row["status"] in ("computed", "cached"))
+        return {str(row["key"]) for row in rows if "key" in row}

@@ -113,9 +113,9 @@ class Options(Work):
         """The options that choose a part of the run, as they are typed; empty: all of it."""
         return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
 
-    def command(self, verb: str, sequence: str) -> str:
-        """The command line that repeats a run of a sequence, by its name or path, as a shell takes it, in one line."""
-        words = ["rille", verb, sequence]
+    def command(self, verb: str, *opened: str) -> str:
+        """The command line that repeats a run of a sequence (``Sequence.opened``), as a shell takes it, in one line."""
+        words = ["rille", verb, *opened]
         words += ["--config", str(self.config)] if self.config else []
         words += ["--frames", self.frames] if self.frames else []
         words += [word for a in self.assignments for word in ("--set", a)]

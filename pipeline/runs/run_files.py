@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
-from rille.pipeline.engine.plain import warn
+from rille.pipeline.engine.plain import one_line, warn
 from rille.pipeline.engine.run import Failure
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import GoneError, Store
@@ -75,15 +75,11 @@ def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
     for h in graph.nodes:
         before = None if h.ref is None else h.ref.seconds
         seconds = h.took.seconds if h.status == "computed" else before
-        reason = _one_line(h.error) if h.error is not None else h.reason
+        reason = one_line(h.error) if h.error is not None else h.reason
         rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason, h.cause))  # type: ignore[arg-type]
     known = {row.label for row in rows}
-    rows += [TaskRow(f.label, "", "failed", None, _one_line(f.error)) for f in failures if f.label not in known]
+    rows += [TaskRow(f.label, "", "failed", None, one_line(f.error)) for f in failures if f.label not in known]
     return tuple(rows)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
+from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
@@ -80,10 +81,9 @@ class Settled:
 
 def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the user has set, by section: of the sequence, and of the stages."""
-    read = configuration.read_toml(options.config) if options.config else {}
+    given = read_toml(options.config, "configuration") if options.config else {}
     # Over the file: --set is said now, --config may be old.
-    configuration.merge(read, configuration.parse_assignments(options.assignments))
-    return configuration.split_dataset(read)
+    return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:
@@ -179,7 +179,6 @@ def perform(
     options: Options,
     *,
     verb: str = "reconstruct",
-    place: str = "",
     kept: list[Workers] | None = None,
     warn: Callable[[str], None] = warn,
 ) -> RunResult:
@@ -189,13 +188,12 @@ def perform(
     ----------
     sequence : its name or path, or itself, where it is open already.
     verb : command that asks for the run.
-    place : of a sequence that is open already: the name or path that it was opened by.
     kept : list of the workers that a run leaves to the next one; whoever gives it ends them.
     warn : takes warnings, one line each: those of the input before anything is computed.
     """
     from rille.pipeline.runs import run_files  # imports matplotlib, which a wrong option should not have to wait for
 
-    opened = _open(sequence, options, verb, place, warn)
+    opened = _open(sequence, options, verb, warn)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
     result = _compute(opened, kept)
@@ -236,14 +234,14 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
     return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
 
 
-def _open(name: str | Sequence, options: Options, verb: str, place: str, warn: Callable[[str], None]) -> _Opened:
+def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[str], None]) -> _Opened:
     """Read the input and lay the run out."""
     started = datetime.now(UTC)
-    settled = settings_of_run(name, options, warn)
+    settled = settings_of_run(given, options, warn)
     sequence, frames, config = settled.sequence, settled.frames, settled.config
     if verb == "drive" and sequence.simulation is None:
         raise ConfigError("RIL-059", f"{sequence.name} is recorded, it cannot be driven", remedy="drive mockup-loop")
-    command = options.command(verb, name if isinstance(name, str) else place or name.name)
+    command = options.command(verb, *(sequence.opened or (sequence.name,)))
     header = f"# {command}\n# rille reconstruct SEQ --config THIS_FILE uses the same parameters.\n\n"
     text = header + configuration.to_toml(config, sequence.parameters)
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))

@@ -25,6 +25,7 @@ from rille.datasets.images import files
 from rille.datasets.inspection import inspect
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
+from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.store.archive import pack
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.index import TABLE, Index
@@ -81,7 +82,7 @@ def times(path: Path) -> None:
 
 
 def configuration(path: Path) -> None:
-    for_dataset, for_stages = config.split_dataset(config.read_toml(path))
+    for_dataset, for_stages = config.split_dataset(read_toml(path, "configuration"))
     config.to_toml(config.build(for_stages))
     open_sequence("mockup-short", for_dataset)
 

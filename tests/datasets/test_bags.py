@@ -300,14 +300,18 @@ def test_a_compressed_image_that_breaks_off_costs_its_frame_alone(tmp_path):
     assert "damage" not in run(sequence.image(2, "left")).meta
 
 
-def test_images_without_time_stamps_are_refused(tmp_path):
-    """All of them but one would be left out."""
-    bag = street(frames=3)
+def test_images_without_time_stamps_have_the_time_of_their_recording(tmp_path):
+    bag = street(frames=3, lag=2_000_000)
     for topic, _, message in bag.rows:
         if topic in (LEFT, RIGHT):
             message.header = bag.header(0)
-    with raises("RIL-993", LEFT, "stamp 0"):
-        open_sequence(str(bag.write(tmp_path)))
+    sequence = open_sequence(str(bag.write(tmp_path / "none")))
+    assert np.diff(sequence.times) == pytest.approx(STEP / 1e9, abs=1e-6)
+    said = [line for line in sequence.warnings if "RIL-994" in line]
+    assert [f"3 images of {topic}" in line for topic, line in zip((LEFT, RIGHT), said, strict=True)] == [True, True]
+    np.testing.assert_array_equal(pixels(sequence, 2, "right"), picture(2, 1))
+    # A recorder that sets its times to the stamps' is no driver without stamps.
+    assert not any("RIL-994" in line for line in open_sequence(str(street().write(tmp_path / "all"))).warnings)
 
 
 def test_images_without_a_partner_are_left_out(tmp_path):

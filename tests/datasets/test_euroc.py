@@ -190,7 +190,7 @@ def _empty(m):
     ("spoil", "expected"),
     [
         (_no_calibration, ("RIL-161", "cam1/sensor.yaml", "cam1")),
-        (_mixed, ("RIL-292", "cam0/data.csv", "line 4")),
+        (_mixed, ("RIL-293", "cam0/data.csv", "line 4", "in one unit")),  # its title says which
         (_empty, ("RIL-217", "cam0/data")),
     ],
 )

@@ -22,7 +22,8 @@ from rille.stages.geometry.lens import Lens
 def exported(tmp_path_factory, tiny, materialise):
     folder = tmp_path_factory.mktemp("export") / "bed"
     sequence = seq.mockup(tiny.model_copy(update={"rig_error_deg": (0.0, 0.2, 0.0)}))
-    return sequence, export(sequence, folder, materialise, pairs=(0, 2))
+    strided = replace(sequence, defaults={**sequence.defaults, "keyframes.stride": 2})
+    return sequence, export(strided, folder, materialise)
 
 
 def test_round_trip(exported, materialise):
@@ -61,7 +62,7 @@ def test_plain_files_say_the_same(exported, materialise):
 def test_both_sizes_are_stated_where_they_differ(exported, materialise, tmp_path):
     sequence, _ = exported
     rig = replace(sequence.rig, right=replace(sequence.rig.right, width=99, height=77))
-    folder = export(replace(sequence, rig=rig), tmp_path / "two", materialise, pairs=())
+    folder = export(replace(sequence, rig=rig), tmp_path / "two", materialise)
     left = sequence.rig.left
     assert (
         f"stereo pairs, left {left.width} x {left.height}, right 99 x 77 pixels." in (folder / "README.txt").read_text()
@@ -112,7 +113,7 @@ def test_interrupted_export_leaves_nothing(tmp_path, tiny, materialise):
 def test_gaps_of_truth_are_kept_and_lost_frames_are_left_out(tiny, tmp_path, materialise):
     sequence = seq.mockup(tiny)
     truth = (None, *sequence.truth[1:])
-    folder = export(replace(sequence, lost={1: "gone"}, truth=truth), tmp_path / "out", materialise, pairs=())
+    folder = export(replace(sequence, lost={1: "gone"}, truth=truth), tmp_path / "out", materialise)
     back = open_sequence(str(folder))
     assert back.frame_names == ("000000", "000002")
     assert back.times == (sequence.times[0], sequence.times[2])

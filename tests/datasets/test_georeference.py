@@ -35,6 +35,7 @@ def test_axes_by_hand() -> None:
         ({"crs": "EPSG:32633"}, ("origin and azimuth_deg missing",)),
         ({"origin": ORIGIN, "azimuth_deg": 3.0}, ("crs missing",)),
         ({"crs": "EPSG:999999"}, ("crs", "no known")),
+        ({"crs": "EPSG:32633", "origin": (47.07, 15.44, 350.0), "azimuth_deg": 3.0}, ("47.07", "degrees", "easting")),
         ({"crs": "EPSG:4326"}, ("crs", "projected")),
         ({"crs": "EPSG:2263"}, ("crs", "0.3048")),
         ({"crs": "http://127.0.0.1:1/crs"}, ("crs", "address")),
@@ -44,6 +45,17 @@ def test_axes_by_hand() -> None:
 def test_what_is_refused(given: dict[str, object], facts: tuple[str, ...]) -> None:
     with raises("RIL-223", "m.toml", *facts):
         validated("RIL-223", World, given, file="m.toml")
+
+
+def test_a_crs_of_ones_own_may_begin_at_the_site() -> None:
+    own = "+proj=tmerc +lat_0=47.07 +lon_0=15.44 +ellps=WGS84 +units=m"
+    assert World(crs=own, origin=(12.5, 7.25, 350.0), azimuth_deg=0.0).place is not None
+
+
+def test_a_crs_is_known_whatever_files_lie_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "EPSG:32633").write_text("another")
+    monkeypatch.chdir(tmp_path)
+    assert World(crs="EPSG:32633", origin=ORIGIN, azimuth_deg=0.0).place is not None
 
 
 def test_no_file_is_opened_for_a_crs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -291,3 +291,14 @@ def test_names_of_one_sensor_in_the_usual_order_are_enough(tmp_path):
         found = read_imu(record_file(tmp_path, names, rows))
         assert found.rates[0].tolist() == [1, 2, 3]
         assert found.forces[0].tolist() == [0, 0, 9.81]
+
+
+def test_accelerations_in_multiples_of_gravity_are_converted_where_the_names_say_so(tmp_path):
+    names = "t," + ",".join(f"gyro_{a}_mrad" for a in "xyz") + "," + ",".join(f"acc_{a} [g]" for a in "xyz")
+    with raises("RIL-995", "gyro_x_mrad"):
+        read_imu(record_file(tmp_path, names, [(t, 0, 0, 0, 0, 0, 1) for t in (0.0, 0.1)]))
+    found = read_imu(
+        record_file(tmp_path, names.replace("_mrad", "_deg_s"), [(t, 90, 0, 0, 0, 0, 1) for t in (0.0, 0.1)])
+    )
+    np.testing.assert_allclose(found.rates[0], [np.pi / 2, 0, 0])
+    np.testing.assert_allclose(found.forces[0], [0, 0, 9.80665])

@@ -69,10 +69,8 @@ max_step = 0.05
 [defaults]
 locus.cell_size = 0.02
 "keyframes.stride" = 1
-[notes]
-text = ["dusty"]
 """
-    s = opened(write_sequence(tmp_path, text, head='name = "dune"'))
+    s = opened(write_sequence(tmp_path, text, head='name = "dune"\nnotes = ["dusty"]'))
     assert (s.name, s.times, s.notes) == ("dune", (0.0, 0.25, 0.5), ("dusty",))
     assert s.pitch == pytest.approx(math.radians(20))
     assert s.vehicle is not None
@@ -295,6 +293,14 @@ def test_tables_of_times_of_other_programs(tmp_path, lines):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", lines)
     assert opened(path).times == (10.0, 10.5, 11.0)
+
+
+def test_the_title_of_a_column_of_times_states_their_unit(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
+    write_lines(tmp_path / "t.txt", ["time_ms,image", "0,00.png", "500,01.png", "1000,02.png"])
+    assert opened(path).times == (0.0, 0.5, 1.0)
+    write_lines(path, [path.read_text() + 'unit = "s"'])
+    assert opened(path).times == (0.0, 500.0, 1000.0)
 
 
 @pytest.mark.parametrize("lines", [["0.0 7", "1.0 8", "2.0 9"], ["0 a", "1 b", "2 c"]])

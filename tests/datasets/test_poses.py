@@ -230,3 +230,21 @@ def test_positions_without_a_measured_coordinate_are_refused_and_without_heights
                 read_positions(tmp_path / "p.csv", "auto", {})
         else:
             assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
+
+
+@pytest.mark.parametrize("name", ["{} [mm]", "{}_mm", "{} (mm)"])
+def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
+    x, y = (name.format(axis) for axis in "xy")
+    (tmp_path / "p.csv").write_text(f"time,{x},{y}\n1,2000,3000\n2,4000,5000\n")
+    assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
+    # What a manifest states goes before what a name says.
+    assert read_positions(tmp_path / "p.csv", "auto", {}, 1.0).positions[0] == (2000.0, 3000.0)
+    found = read(tmp_path, f"time,{x},{y},yaw_deg\n1,2000,3000,90\n")
+    np.testing.assert_allclose(found.poses[0].translation, [2, 3, 0])
+    np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
+
+
+def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):
+    (tmp_path / "p.csv").write_text("time,x_deg,y_deg\n1,15,47\n2,15,47\n")
+    with raises("RIL-995", "x_deg"):
+        read_positions(tmp_path / "p.csv", "auto", {})

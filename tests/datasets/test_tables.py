@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.text.tables import read_table
+from rille.datasets.text.tables import ANGLES, LENGTHS, read_table, unitless
 
 
 def table(tmp_path, text, encoding="utf-8"):
@@ -99,3 +99,36 @@ def test_a_row_of_units_below_the_names_is_theirs(tmp_path, units):
 
 def test_words_below_the_names_that_are_no_units_are_the_names(tmp_path):
     assert table(tmp_path, "a,b\nm,x\n1,2\n").header == ("m", "x")
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "bare"),
+    [
+        ("x [mm]", "mm", "x"),
+        ("north_cm", "cm", "north"),
+        ("up (feet)", "ft", "up"),
+        ("yaw_degrees", "", "yaw_degrees"),
+        ("yaw (degrees)", "deg", "yaw"),
+        ("w_RS_S_x [rad s^-1]", "rad s", "w_rs_s_x"),
+        ("w_RS_S_x", "", "w_rs_s_x"),
+        ("gyro_deg_x", "deg", "gyro_x"),
+        ("gyro_x [\N{DEGREE SIGN}/s]", "deg s", "gyro_x"),
+        ("acc_x (m/s2)", "m s", "acc_x"),
+        ("x (east)", "", "x"),
+    ],
+)
+def test_the_unit_in_the_name_of_a_column(tmp_path, name, unit, bare):
+    found = table(tmp_path, f"time,{name}\n1,2\n")
+    assert (found.unit(1), unitless(found.header[1])) == (unit, bare)
+
+
+def test_units_are_brought_to_si_unless_the_caller_states_one(tmp_path):
+    found = table(tmp_path, "time,x_mm,y [km],z\n1,2,3,4\n")
+    assert found.measures([1, 2, 3], LENGTHS).tolist() == [[2e-3, 3e3, 4.0]]
+    assert found.measures([1, 2, 3], LENGTHS, 0.5).tolist() == [[1.0, 1.5, 2.0]]
+    with raises("RIL-995", "'x_mm'"):
+        found.measures([1], ANGLES)
+
+
+def test_a_line_of_unit_words_below_a_title_is_a_line_of_names(tmp_path):
+    assert table(tmp_path, "# a log of 2026\ns,m,m\n1,2,3\n").header == ("s", "m", "m")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import pickle
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from raising import raises
 from toys.browser import Browser
 
 import rille
-from rille.pipeline import api
+from rille.pipeline import api, steps
 from rille.pipeline.engine import code_digest, events
 from rille.pipeline.flow import config as configuration
 
@@ -38,13 +39,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> rille.Run:
 
 def test_it_gives_the_digests_of_the_command_line(run: rille.Run) -> None:
     folder = run.folder.parents[2]
-    given = [f"--set={word}" for word in api.assignments({"mockup": MOCKUP, **STAGES})]
+    given = [f"--set={word}" for word in steps.assignments({"mockup": MOCKUP, **STAGES})]
     where = ["--runs", str(folder / "again"), "--cache", str(folder / "cache"), "--executor", "inline", "--quiet"]
     command = [sys.executable, "-m", "rille.pipeline.cli", "reconstruct", "mockup-short", *given, *where]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert "computed 0," in said, "all that it needs was computed from Python"
     assert digests(folder / "again/mockup-short/latest") == digests(run.folder)
     assert len(digests(run.folder)) > 30
+    asked = shlex.split(run.report["command"])
+    assert asked[:3] == ["rille", "reconstruct", "mockup-short"]
+    assert {"--set", *given} == {word if word == "--set" else f"--set={word}" for word in asked[3:]}
 
 
 def test_each_public_name_stands_in_the_reference() -> None:
@@ -179,7 +183,7 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", ["two  blanks", "a\nline", 'a "quote"', [[1, 2], [3, 4]], True, 1e-7])
 def test_settings_come_back_from_their_assignments(value: object) -> None:
-    words = api.assignments({"section": {"key": value}})
+    words = steps.assignments({"section": {"key": value}})
     assert "\n" not in words[0]
     assert configuration.parse_assignments(words) == {"section": {"key": value}}
 

@@ -257,6 +257,20 @@ def test_a_crate_of_data_alone_is_no_run(tmp_path: Path) -> None:
     assert rocrate.read(tmp_path) is None
 
 
+def test_a_crate_takes_no_file_along_that_a_link_names(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("of another folder")
+    (run / "report.json").write_text('{"command": "rille reconstruct seq"}')
+    (run / "dem.tif").symlink_to(tmp_path / "secret")
+    with raises("RIL-723", "dem.tif"):
+        export_run("rocrate", run, run / "crate", Store(run.parents[2] / "cache"))
+    (run / "dem.tif").unlink()
+    (run / "terrain.zarr").mkdir()
+    (run / "terrain.zarr" / "0.0").symlink_to(tmp_path / "secret")
+    with raises("RIL-723", "0.0"):
+        export_run("rocrate", run, run / "crate", Store(run.parents[2] / "cache"))
+    assert not (run / "crate").exists()
+
+
 def test_a_drive_makes_no_crate(run: Path) -> None:
     (run / "report.json").write_text('{"command": "rille drive mockup-loop"}')
     with raises("RIL-611", "config.toml"):

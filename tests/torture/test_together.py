@@ -10,7 +10,7 @@ import time
 import pytest
 from torn import look
 
-from rille.pipeline.engine import events
+from rille.pipeline.runs import lookup
 
 RUNS = 3
 
@@ -75,7 +75,7 @@ def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, 
             computed += sum(n["status"] == "computed" for n in run["nodes"].values())
             wrong += look.wrong({n["key"]: n["digest"] for n in run["nodes"].values()}, calm["digests"])
         wrong += look.wrong(look.decoded(cache), calm["digests"])
-        named = {key for file in runs.glob("*/*/ledger.jsonl") for key in events.keys(file)}
+        named = {key for file in runs.glob("*/*/ledger.jsonl") for key in lookup.used(file.parent)}
         lost += sorted(named - set(look.published(cache)))
         shutil.rmtree(cache)
     expected = range(RUNS * tries * total + 1)

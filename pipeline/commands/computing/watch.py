@@ -180,9 +180,7 @@ class _Watched:
     def run(self, options: WatchOptions, seen: _Seen) -> session.RunResult:
         """Run, with a folder that takes the place of that of the run before."""
         options = replace(options, frames=None if seen.frames == seen.sequence.frames else f"0:{seen.frames}")
-        result = session.perform(
-            seen.sequence, options, place=self.seq, kept=self.kept, warn=lambda line: self.say(warned(line))
-        )
+        result = session.perform(seen.sequence, options, kept=self.kept, warn=lambda line: self.say(warned(line)))
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
         self.folder = result.folder

@@ -16,15 +16,8 @@ from scipy.spatial import cKDTree
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.export.read_dem import (
-    DemFile,
-    crs_name,
-    no_ground,
-    read_elevation,
-    read_ortho,
-    refuse_unlike_systems,
-    transform_of,
-)
+from rille.pipeline.export import read_dem
+from rille.pipeline.export.read_dem import DemFile, crs_name
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, output_file
@@ -75,15 +68,15 @@ def compare_dem(
     paths = [lookup.elevation(text, runs) for text in (a, b)]
     raster, facts = output_file(output, ".tif"), output_file(output, ".json")
     check_output(raster, others={(p / "dem.tif" if p.is_dir() else p).resolve(): "a model" for p in paths})
-    one, other = (read_elevation(path) for path in paths)
+    one, other = (read_dem.read_elevation(path) for path in paths)
     place = None
     if align == "place":
         motion, place = _placed(paths, one, other)
         one, align = moved(one, motion), "rigid"
-    refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
+    read_dem.refuse_unlike_systems({one.name: one.crs, other.name: other.crs})
     if one.frame and other.frame and (one.frame == ON_PLANE) != (other.frame == ON_PLANE):
         name = (one if one.frame == ON_PLANE else other).name
-        raise no_ground(name)
+        raise read_dem.no_ground(name)
     figures, error, cells = measure(one, other, align)
     figures["place"] = place
     for line in figures["warnings"]:
@@ -96,7 +89,7 @@ def compare_dem(
     print("\n".join(lines))
     atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
     crs = (other if np.array_equal(cells.matrix, other.grid.matrix) else one).crs
-    profile = {"driver": "COG", "crs": crs or None, "transform": transform_of(cells)}
+    profile = {"driver": "COG", "crs": crs or None, "transform": read_dem.transform_of(cells)}
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
     print(f"{raster}  {facts}")
     return COMPLETE
@@ -108,7 +101,7 @@ def _placed(paths: Sequence[Path], one: DemFile, other: DemFile) -> tuple[Floats
     if files:
         text = f"{files[0]} is no run: it has no ortho image"
         raise InputError("RIL-908", text, remedy="leave --align place out")
-    image, reference = (read_ortho(path / "ortho.tif")[0] for path in paths)
+    image, reference = (read_dem.read_ortho(path / "ortho.tif")[0] for path in paths)
     placed = register((image, reference), (one.grid, other.grid))
     x, y, heading = from_above(placed.pose)
     cos, sin = math.cos(heading), math.sin(heading)

@@ -22,18 +22,8 @@ from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import (
-    COMPLETE,
-    RUNS,
-    CacheFolder,
-    Output,
-    Run,
-    Runs,
-    cache_folder,
-    check_new,
-    check_output,
-)
+from rille.pipeline.runs import lookup, options
+from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs
 from rille.stages.calibration.parameter_selection import Parameter, decide
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
 from rille.stages.calibration.rig import RigParams
@@ -81,10 +71,10 @@ def rig(
     output
         TOML file to write.
     """
-    check_output(output, ".toml")
+    options.check_output(output, ".toml")
     if output.exists() and "corrected_by_degrees" not in read_toml(output, "rig"):
-        check_new(output, ", and is no rig")
-    store, matches, given = Store(cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
+        options.check_new(output, ", and is no rig")
+    store, matches, given = Store(options.cache_folder(cache)), dict[str, list[PointPairs]](), dict[str, Any]()
     folders = list(dict.fromkeys(lookup.find(name, runs) for name in (run, *more)))
     for folder in folders:
         with lookup.reading(folder):
@@ -103,7 +93,7 @@ def rig(
         warn(line)
     print(f"wrote        {output}\nnext         in the manifest of each sequence:")
     print(f'\n[rig]\nfile = "{output.resolve()}"')
-    return COMPLETE
+    return options.COMPLETE
 
 
 def _matches(artifacts: RunArtifacts) -> Iterator[PointPairs]:

@@ -45,10 +45,6 @@ MAX_FOCAL_SIGMA = 0.01
 MIN_COVER = 0.5
 """Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
-
-OURS = "x_right = R x_left + T, metres; board in inner corners, square in metres, residuals in pixels RMS"
-"""Comment in the files that are written."""
-
 Image = NDArray[Any]
 
 
@@ -108,11 +104,17 @@ def calibrate(
         Keep views whose residuals are far above the others'.
     """
     check_output(output, *((".yaml", ".yml") if output.suffix else ()))
-    if output.exists() and OURS not in read_text(output, "calibration"):
+    if output.exists() and "avg_reprojection_error:" not in read_text(output, "calibration"):
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
-    boards = find_boards(pairing.pair_up(*_files(left, right)), given)
+    pictures = _files(left, right)
+    try:
+        pairs = pairing.pair_up(*pictures)
+    except InputError as error:  # its remedies are keys of a manifest
+        remedy = "give both pictures of a pair one name or number, each side in a folder or glob of its own"
+        raise InputError(error.code, error.message, remedy=remedy) from error
+    boards = find_boards(pairs, given)
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
@@ -275,7 +277,7 @@ def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
     content["standard_deviations"] = {name.replace(" ", "_"): value for name, value in rig.sigma.items()}
     # In memory: the file is written by Python, whose errors say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    file.writeComment(OURS)
+    file.writeComment("x_right = R x_left + T, square in metres; board in inner corners; residuals in pixels RMS")
     _store(file, content)
     return str(file.releaseAndGetString())
 

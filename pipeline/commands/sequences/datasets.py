@@ -41,15 +41,14 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
     """
     for_dataset = config.parse_assignments(assignments)
     config.refuse_other_sections(for_dataset, config.DATASET_SECTIONS, "datasets export")
-    place = cache_folder(cache)
-    store = Store(place)
+    store = Store(cache_folder(cache))
     # Before minutes of rendering.
     store.writable()
 
     def artifact(source: Source) -> Ref:  # rendering is cached like any other work
         refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
         label = source.module.rsplit(".", 1)[-1]
-        return ensure(place, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
+        return ensure(store.root, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
 
     sequence = registry.open_sequence(seq, for_dataset)
     print(export(sequence, directory, lambda source: store.open(artifact(source))))

@@ -44,9 +44,8 @@ def init(
     if is_bag(directory):
         text = f"no manifest is written for the bag {directory}: it opens as it is"
         raise hindered or ConfigError("RIL-938", text, remedy="rille check opens it")
-    name = f"{derived_name(directory.resolve().name)}.rille.toml"
     findings = inspect(directory)
-    path = output if output is not None else Path(name)
+    path = output or Path(f"{derived_name(directory.resolve().name)}.rille.toml")
     check_output(path, ".toml")
     if not force:
         check_new(path, remedy="give another --output, or overwrite it by --force")

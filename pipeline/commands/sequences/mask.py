@@ -41,13 +41,12 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     # Twenty images: more would not change the mask.
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, 20).round().astype(int))]
     written = []
-    for camera in CAMERAS:
+    for camera, path in paths.items():
         images = [pair.taken(camera) for pair in pairs]
         body = still(images)
         if not body.any():
             print(f"{camera:12s} nothing keeps its place in {len(images)} images")
             continue
-        path = paths[camera]
         seen = cv2.cvtColor(np.rint(grey(images[0])).astype(np.uint8), cv2.COLOR_GRAY2BGR)
         seen[body] = seen[body] // 2 + np.array([0, 0, 127], np.uint8)
         for name, picture in ((path, np.where(body, 0, 255).astype(np.uint8)), (path.with_suffix(".look.png"), seen)):

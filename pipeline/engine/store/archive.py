@@ -16,6 +16,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 
+from rille.datasets.text.reading import mark
+
 MANIFEST = "manifest.json"
 
 MAX_READ_BYTES = 4_000_000
@@ -101,8 +103,7 @@ def opened(path: str) -> Iterator[Archive]:
         There is none.
     """
     try:
-        status = os.stat(path)
-        yield _kept(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+        yield _kept(path, mark(os.stat(path)))
     except MALFORMED as error:
         raise BrokenError(str(error)) from None
     except OSError as error:
@@ -113,6 +114,6 @@ def opened(path: str) -> Iterator[Archive]:
 
 
 @lru_cache(KEPT_OPEN)
-def _kept(path: str, status: tuple[int, ...]) -> Archive:
-    """The archive at a path while the file's ``status`` stays the same; it is closed when nobody refers to it."""
+def _kept(path: str, marked: str) -> Archive:
+    """The archive at a path while the file's mark stays the same; it is closed when nobody refers to it."""
     return Archive(_RegularFile(path))

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from rille.datasets.text import reading
 from rille.pipeline.engine.failures import CLOSED, FULL
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -78,10 +79,5 @@ def quarantine(path: Path, root: Path, name: str) -> Path:
 
 
 def mark(status: os.stat_result) -> str:
-    """Inode, size and times of a file: they change with its content (empty: it might change, and keep them).
-
-    No call can set the time of change.
-    """
-    if max(status.st_mtime, status.st_ctime) > time.time() - RACY_S:
-        return ""
-    return f"{status.st_ino:x}.{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ctime_ns:x}"
+    """Inode, size and times of a file (:func:`reading.mark`); empty: it might change, and keep them."""
+    return "" if max(status.st_mtime, status.st_ctime) > time.time() - RACY_S else reading.mark(status)

@@ -66,7 +66,7 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
     """Remove artifacts whose key is not in ``keep``, and leftovers.
 
     Only files that were neither made nor used within ``grace`` seconds are removed, since a run may be under way.
-    ``keep`` are the keys of the kept runs (:func:`rille.pipeline.engine.events.keys`). In a shared folder the age of a
+    ``keep`` are the keys of the kept runs (:func:`rille.pipeline.runs.lookup.used`). In a shared folder the age of a
     file is this machine's clock minus the server's: keep ``grace`` well above the difference of the clocks.
 
     Returns the bytes of each file that was removed, or would be in a dry run, by stage; ``""`` holds those that are no

@@ -21,6 +21,7 @@ from typing import Any
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.read_dem import refuse_irregular
 from rille.stages.core.errors import InputError
 
 METADATA = "ro-crate-metadata.json"
@@ -36,6 +37,7 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     files = []
     for name, what, _ in catalogue.listed(run.run):
         if what and (run.run / name).exists():  # files without an explanation are exports, not files of the run
+            refuse_irregular(run.run / name)
             copy = shutil.copytree if (run.run / name).is_dir() else shutil.copy2
             copy(run.run / name, folder / name)
             files += list(_files(folder, name, what))

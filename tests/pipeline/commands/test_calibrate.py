@@ -160,6 +160,12 @@ def test_complaints_say_what_to_change(tmp_path):
         calibrate(tmp_path / "plain", tmp_path / "plain", **given)
     assert not (tmp_path / "rig.yaml").exists()
     (tmp_path / "rig.yaml").write_text("camera_matrix: of another program\n")
+    for side, name in (("left", "a"), ("left", "b"), ("right", "c"), ("right", "d")):
+        (tmp_path / side).mkdir(exist_ok=True)
+        (tmp_path / side / f"{name}.png").write_bytes(b"")
+    with raises("RIL-257", "one name or number") as caught:
+        calibrate(tmp_path / "left", tmp_path / "right", square=0.02)
+    assert "images.pair" not in str(caught.value), "there is no manifest"
     with raises("RIL-038", "--output"):
         calibrate(folder, folder, **given)
 

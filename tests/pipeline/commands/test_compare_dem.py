@@ -180,6 +180,11 @@ def test_one_clear_line_for_what_cannot_be_compared(tmp_path: Path, capsys: pyte
     assert "has no dem.tif" in refused(capsys, tmp_path / "folder", run)
     assert "RIL-043" in refused(capsys, run, away, "-o", tmp_path / "away")
     assert "RIL-043" in refused(capsys, run, away, "-o", run / "dem")
+    for other, band in (("dem_sigma.tif", "elevation_std"), ("ortho.tif", "ortho")):
+        assert f"{other} has {band}, no elevation" in refused(capsys, run / other, run)
+    compare(run, run, output=tmp_path / "before")
+    capsys.readouterr()
+    assert "before.tif has difference" in refused(capsys, tmp_path / "before.tif", run)
     shutil.copy(run / "dem.tif", tmp_path / "same.tif")
     assert "too flat" not in refused(capsys, run, run, "--align", "nothing")
 

@@ -45,7 +45,7 @@ def test_sessions_in_frames_of_their_own_become_one_terrain(tmp_path: Path, caps
     known = np.isfinite(error)
     assert np.sqrt(np.mean(error[known] ** 2)) < 1.2 * SIGMA
     assert known.sum() > 1.15 * np.isfinite(read_elevation_of(a)).sum()
-    sigma = read_raster(tmp_path / "out" / "dem_sigma.tif").grid.values
+    sigma = read_raster(tmp_path / "out" / "dem_sigma.tif", "elevation_std").grid.values
     assert 0.6 < np.sqrt(np.nanmean((error / sigma) ** 2)) < 1.3
     assert (tmp_path / "out" / "ortho.tif").exists()
     assert "cells in common" in capsys.readouterr().out

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from raising import raises
 
+from rille.datasets.text.reading import read_toml
 from rille.pipeline.flow import config
 
 
@@ -52,7 +53,7 @@ def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
     assert config.build(config.parse_assignments(["keyframes.preset=navigation", "hfvm.rounds=3"])).hfvm.rounds == 3
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(built))
-    assert config.build(config.read_toml(path)) == built
+    assert config.build(read_toml(path, "configuration")) == built
 
 
 def test_unknown_key_names_the_nearest() -> None:
@@ -79,18 +80,18 @@ def test_written_configuration_reads_back_as_the_same(tmp_path: Path) -> None:
     built = config.build(config.parse_assignments(["keyframes.stride=7", "vehicle.max_step=0.05"]))
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(built))
-    again = config.build(config.read_toml(path))
+    again = config.build(read_toml(path, "configuration"))
     assert again == built
     assert again.vehicle.max_step == 0.05
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
     with raises("RIL-138"):
-        config.read_toml(tmp_path / "none.toml")
+        read_toml(tmp_path / "none.toml", "configuration")
     bad = tmp_path / "bad.toml"
     bad.write_text("[select\nstride=1")
     with raises("RIL-026"):
-        config.read_toml(bad)
+        read_toml(bad, "configuration")
 
 
 @pytest.mark.parametrize(
