@@ -168,19 +168,24 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def find_views(folder: Path, images: list[Path]) -> FoundImages:
-    """The two sets of images, by the tokens in their names that make most pairs.
+    """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
 
     Raises
     ------
     InputError
-        No token tells a left image from a right one.
+        No names tell the images of two cameras apart.
     """
     groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
-    for path in images:
-        at = side_of(_relative(path.with_suffix(""), folder))
+    names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
+    for path, name in zip(images, names, strict=True):
+        at = side_of(name)
         if at is not None:
             groups[at[0], _place(path, at[2])][at[1]].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
+    if not both and (parts := pairing.by_one_word(names)):
+        left, right = ([images[i] for i in of] for of in parts.values())
+        both, tokens = {(0, ""): (left, right)}, (tuple[str, str](parts),)
+        lines.append("of the two cameras the first by name is taken for the left one: `rille check` shows if it is not")
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
@@ -194,23 +199,23 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     # Most pairs first; of as many, the surest token (SIDES), and the shortest name: not left_depth before left.
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
-    sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
+    sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
         matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
         headers, matched = pairing.common_headers(matched)
         sizes = sizes_of(headers)
     except InputError as error:
         trouble = str(error)
-    tokens = pairing.SIDES[key[0]]
+    sides = tokens[key[0]]
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
         len(matched),
         sizes,
-        f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
+        f"{len(left)} left and {len(right)} right images, told apart by {sides[0]!r} and {sides[1]!r}",
         trouble,
         all(stamp_of(path.stem) for path in left),
-        tokens,
+        sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
         tuple(pattern(sides[0], folder) for place, sides in both.items() if place != key),

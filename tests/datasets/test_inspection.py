@@ -73,6 +73,41 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "patterns"),
+    [
+        ("A/{}.png", "B/{}.png", ("A/*.png", "B/*.png")),
+        ("cam1/{}.png", "cam2/{}.png", ("cam1/*.png", "cam2/*.png")),
+        ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
+        ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
+    ],
+)
+def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, left, right, patterns):
+    write_images(tmp_path, [name.format(k) for k in (1, 2, 3) for name in (left, right)])
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    found = inspect(tmp_path)
+    assert (found.views.pairs, found.views.trouble) == (3, "")
+    assert patterns in (None, (found.views.left, found.views.right))
+    text = manifest_text(found, ".")
+    assert "first by name is taken for the left one" in text
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text)
+    assert open_manifest(path, Digests()).frames == 3
+
+
+def test_names_that_differ_in_several_ways_tell_no_cameras_apart(tmp_path):
+    write_images(tmp_path, [f"run{k}/cam_{c}.png" for k in (1, 2) for c in "ab"])
+    with raises("RIL-194"):
+        inspect(tmp_path)
+
+
+def test_a_counter_that_began_anew_is_no_reason_to_pair_by_time_stamps(tmp_path):
+    write_images(tmp_path, both("{side}/img{name}.png", ["998", "999", "000", "001"]))
+    text = manifest_text(inspect(tmp_path), ".")
+    assert "began anew" in text
+    assert "pair" not in tomllib.loads(text)["images"]
+
+
 def test_names_that_are_time_stamps(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1403715273262142976", "1403715273312143104"]))
     found = inspect(tmp_path)
@@ -401,7 +436,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "1 bag (drive.bag)",
     ):
         assert words in text
-    assert "1 image without a header (r.raw): " in text
+    assert "1 headerless image (r.raw): " in text
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
     assert len(found.unread) == 8
