@@ -209,9 +209,9 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
-    """Places of the names by the one word in which they are of two kinds, and otherwise in pairs, as ``A/07``, ``B/07``.
+    """Places of the names by the one word, of two, that parts them into pairs which are alike but for it (A/07, B/07).
 
-    In natural order; nothing where no word is that, or more than one.
+    In natural order of the words; nothing where no word does so, or more than one.
     """
     found = []
     words = [re.split(r"([^\W_]+)", name) for name in names]
@@ -245,9 +245,9 @@ def pair_up(
     Parameters
     ----------
     left, right : image files of each camera.
-    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which they differ), ``nearest`` (time
-        stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest where time stamps
-        differ, and number where the names of the two cameras have nothing in common.
+    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which all differ),
+        ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest
+        where time stamps differ, and number where the names of the two cameras have nothing in common.
     gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
         are fewer than the whole pairs.
     growing : images behind the last pair, by name or number, are left out: their partners are still to come.
