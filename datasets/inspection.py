@@ -115,7 +115,8 @@ def inspect(folder: Path) -> Findings:
     if not folder.is_dir():
         remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
         raise InputError("RIL-193", f"{folder} is no folder", remedy=remedy)
-    there = _files(folder)
+    search = Search()
+    there = _files(folder, search)
     paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
         writable(_relative(path, folder))
@@ -123,7 +124,9 @@ def inspect(folder: Path) -> Findings:
     try:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     except InputError as error:
-        raise InputError(error.code, "; ".join([error.message, *unread(strange)]), remedy=error.remedy) from error
+        text = "; ".join([error.message, *search.closed[:1], *unread(strange)])
+        raise InputError(error.code, text, remedy=error.remedy) from error
+    found.unread += search.closed
     found.unread += [f"{of} and its right images: of another set" for of in found.views.others]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
@@ -150,9 +153,9 @@ def inspect(folder: Path) -> Findings:
     return found
 
 
-def _files(folder: Path) -> list[Path]:
+def _files(folder: Path, search: Search) -> list[Path]:
     """Files below a folder in natural order, without hidden ones and what Rille wrote, its manifests and runs."""
-    found = list(Search().below(folder, DEPTH, links=True))
+    found = list(search.below(folder, DEPTH, links=True))
     # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
     runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
     paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)

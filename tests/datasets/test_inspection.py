@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tomllib
 from pathlib import Path
 
@@ -476,6 +478,26 @@ def test_folders_that_are_links_are_looked_into_once(tmp_path):
         (tmp_path / "here" / "deep" / side).symlink_to(tmp_path / "here")
     found = inspect(tmp_path / "here").views
     assert (found.left, found.right, found.pairs) == ("left/*.png", "right/*.png", 2)
+
+
+@pytest.mark.parametrize("error", [PermissionError(errno.EACCES, "Permission denied"), OSError(errno.ENOTCONN, "gone")])
+def test_a_folder_that_cannot_be_read_is_not_said_to_hold_nothing(tmp_path, monkeypatch, error):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    path = tmp_path / "m.rille.toml"
+    path.write_text(manifest_text(inspect(tmp_path), "."))
+    scan = os.scandir
+
+    def closed(place):
+        if Path(place).name == "right":
+            raise error
+        return scan(place)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    with raises("RIL-194", f"right cannot be read: {error.strerror}"):
+        inspect(tmp_path)
+    with raises("RIL-138", f"right cannot be read: {error.strerror}"):
+        open_manifest(path, Digests())
 
 
 def test_what_archives_of_a_mac_add_is_passed_over(tmp_path):
