@@ -112,7 +112,7 @@ def calibrate(
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
-    boards = find_boards(pairing.pair_up(*_files(left, right)), given)
+    boards = find_boards(pairing.pair_up(*_files(left, right), gaps=True), given)
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
@@ -158,14 +158,16 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     InputError
         An image cannot be read, or too few pairs show a board of one size.
     """
-    images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in pairs}
+    whole = [p for p in pairs if not p.absent]
+    images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in whole}
     sizes = {name: tuple(image.shape[::-1] for image in both) for name, both in images.items()}
     # One picture of another size is a slip; the others still calibrate.
     usual: Any = Counter(sizes.values()).most_common(1)[0][0]
     if corners is None:
         corners = chessboard.find_size(image for name in images if sizes[name] == usual for image in images[name])
     out = Boards(corners, usual)
-    out.left_out = [(name, why) for name, both in images.items() if (why := out.take(name, both))]
+    alone = [(p.name, p.absent) for p in pairs if p.left.exists() != p.right.exists()]
+    out.left_out = alone + [(name, why) for name, both in images.items() if (why := out.take(name, both))]
     if out.left_out and len(out.views) < LEAST_VIEWS:
         raise InputError(
             "RIL-961",
