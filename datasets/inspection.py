@@ -186,8 +186,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
             groups[at[0], _place(path, at[2])][at[1]].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both and (parts := pairing.by_one_word(names)):
-        left, right = ([images[i] for i in of] for of in parts.values())
-        both, tokens = {(0, ""): (left, right)}, (tuple[str, str](parts),)
+        (first, ours), (second, theirs) = parts.items()
+        both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
         lines.append("of the two cameras the first by name is taken for the left one: `rille check` shows if it is not")
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]

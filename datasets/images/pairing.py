@@ -28,18 +28,9 @@ SHARE, MOST_APART = 0.25, 0.01
 
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
-    ("cam0", "cam1"),
-    ("cam_0", "cam_1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("image_0", "image_1"),
-    ("image_2", "image_3"),
-    ("image_00", "image_01"),
-    ("image_02", "image_03"),
-    ("infra1", "infra2"),
-    ("im0", "im1"),
-    ("view0", "view1"),
-    ("i1", "i2"),
+    *((f"{name}0", f"{name}1") for name in ("cam", "cam_", "camera", "camera_", "image_", "image_0", "im", "view")),
+    *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
+    *((f"{name}1", f"{name}2") for name in ("infra", "i")),
     ("l", "r"),
 )
 """Tokens that name the left and the right camera in file and folder names, the surest first."""
