@@ -188,7 +188,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if not both and (parts := pairing.by_one_word(names)):
         (first, ours), (second, theirs) = parts.items()
         both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
-        lines.append("of the two cameras the first by name is taken for the left one: `rille check` shows if it is not")
+        taken = f"{first!r} and {second!r} are taken for the left and the right camera"
+        lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"

@@ -91,7 +91,7 @@ def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, l
     assert (found.views.pairs, found.views.trouble) == (3, "")
     assert patterns in (None, (found.views.left, found.views.right))
     text = manifest_text(found, ".")
-    assert "first by name is taken for the left one" in text
+    assert "are taken for the left and the right camera, in order" in text
     path = tmp_path / "m.rille.toml"
     path.write_text(text)
     assert open_manifest(path, Digests()).frames == 3
