@@ -273,8 +273,7 @@ class Search:
         Raises
         ------
         InputError
-            The pattern is empty or absolute, there is too much to look at, or nothing is found where a folder cannot be
-            read.
+            The pattern is empty or absolute, or there is too much to look at.
         """
         *above, last = pattern.split("/")
         if not last or pattern.startswith("/"):
@@ -290,10 +289,7 @@ class Search:
                 # os.path, here and below: pathlib raises where a name is longer than the system allows.
                 places = [place / part for place in places if os.path.isdir(place / part)]
             places = list(dict.fromkeys(places))
-        found = [path for place in places for path in self._named(place, last) if is_file(path)]
-        if self.closed and not found:
-            raise InputError("RIL-138", self.closed[0], remedy="check the path and its rights")
-        return found
+        return [path for place in places for path in self._named(place, last) if is_file(path)]
 
     def _named(self, folder: Path, pattern: str) -> list[Path]:
         """What a pattern names, of hidden ones (as macOS adds to archives) nothing unless it begins with a dot."""

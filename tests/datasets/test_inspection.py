@@ -496,7 +496,7 @@ def test_a_folder_that_cannot_be_read_is_not_said_to_hold_nothing(tmp_path, monk
     monkeypatch.setattr(os, "scandir", closed)
     with raises("RIL-194", f"right cannot be read: {error.strerror}"):
         inspect(tmp_path)
-    with raises("RIL-138", f"right cannot be read: {error.strerror}"):
+    with raises("RIL-217", f"right cannot be read: {error.strerror}"):
         open_manifest(path, Digests())
 
 
