@@ -117,7 +117,8 @@ def inspect(folder: Path) -> Findings:
     if not folder.is_dir():
         remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
         raise InputError("RIL-193", f"{folder} is no folder", remedy=remedy)
-    there = _files(folder)
+    search = Search()
+    there = _files(folder, search)
     paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
     for path in paths:
         writable(_relative(path, folder))
@@ -125,7 +126,9 @@ def inspect(folder: Path) -> Findings:
     try:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     except InputError as error:
-        raise InputError(error.code, "; ".join([error.message, *unread(strange)]), remedy=error.remedy) from error
+        text = "; ".join([error.message, *search.closed[:1], *unread(strange)])
+        raise InputError(error.code, text, remedy=error.remedy) from error
+    found.unread += search.closed
     found.unread += [f"{of} and its right images: of another set" for of in found.views.others]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
@@ -152,9 +155,9 @@ def inspect(folder: Path) -> Findings:
     return found
 
 
-def _files(folder: Path) -> list[Path]:
+def _files(folder: Path, search: Search) -> list[Path]:
     """Files below a folder in natural order, without hidden ones and what Rille wrote, its manifests and runs."""
-    found = list(Search().below(folder, DEPTH, links=True))
+    found = list(search.below(folder, DEPTH, links=True))
     # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
     runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
     paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)
@@ -170,19 +173,25 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def find_views(folder: Path, images: list[Path]) -> FoundImages:
-    """The two sets of images, by the tokens in their names that make most pairs.
+    """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
 
     Raises
     ------
     InputError
-        No token tells a left image from a right one.
+        No names tell the images of two cameras apart.
     """
     groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
-    for path in images:
-        at = side_of(_relative(path.with_suffix(""), folder))
+    names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
+    for path, name in zip(images, names, strict=True):
+        at = side_of(name)
         if at is not None:
             groups[at[0], _place(path, at[2])][at[1]].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
+    if not both and (parts := pairing.by_one_word(names)):
+        (first, ours), (second, theirs) = parts.items()
+        both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
+        taken = f"{first!r} and {second!r} are taken for the left and the right camera"
+        lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
         named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
@@ -196,23 +205,23 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     # Most pairs first; of as many, the surest token (SIDES), and the shortest name: not left_depth before left.
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
-    sizes, trouble, matched, lines = None, "", tuple[ImagePair, ...](), list[str]()
+    sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
         matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
         headers, matched = pairing.common_headers(matched)
         sizes = sizes_of(headers)
     except InputError as error:
         trouble = str(error)
-    tokens = pairing.SIDES[key[0]]
+    sides = tokens[key[0]]
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
         len(matched),
         sizes,
-        f"{len(left)} left and {len(right)} right images, told apart by {tokens[0]!r} and {tokens[1]!r}",
+        f"{len(left)} left and {len(right)} right images, told apart by {sides[0]!r} and {sides[1]!r}",
         trouble,
         all(stamp_of(path.stem) for path in left),
-        tokens,
+        sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
         tuple(pattern(sides[0], folder) for place, sides in both.items() if place != key),

@@ -214,7 +214,8 @@ def _meanings(table: TextTable) -> dict[str, int]:
     """Columns by what their names mean."""
     columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
-        matches = ((pattern.fullmatch(unitless(name)), meaning) for pattern, meaning in WORDS)
+        bare = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
+        matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
         meant = next((meaning(match) for match, meaning in matches if match), None)
         if meant is not None:
             columns.setdefault(meant, k)
@@ -238,14 +239,15 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     order = ORDERED.get(form, ())
-    if not order or table.columns < len(order) or (form == "tum" and table.columns > len(order)):
+    more = table.columns > len(order) and (form == "tum" or (format == "auto" and table.header))  # of other meaning
+    if not order or table.columns < len(order) or more:
         seen = f"columns {', '.join(table.header)}" if table.header else f"{table.columns} numbers"
         stated = "" if format == "auto" else f" of format {format}"
         raise InputError(
             "RIL-264",
             f"{table.name}, line {table.lines[0]}: {seen} are no pose{stated}",
             remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv), as "
-            "time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg",
+            "time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg; or state the format",
         )
     return {name: k for k, name in enumerate(order)}
 

@@ -36,6 +36,7 @@ from rille.datasets import registry
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
@@ -283,7 +284,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
 
 def _rows_first(image: Any) -> Any:
     """An image of xarray whose dimensions by their names are column and row, transposed; any other as it is."""
-    dims: tuple[object, ...] = getattr(image, "dims", ())
+    dims: tuple[object, ...] = tuple(getattr(image, "dims", ()))  # those of a Dataset have no order
     return image.transpose() if len(dims) == 2 and dims[0] in ("x", "col", "column", "width") else image
 
 
@@ -595,13 +596,18 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
 
 def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bundle:
     """What a step before has made by ``stage``; ``variable`` tells its datasets from those of the other steps."""
-    there = {
-        "attribute rille": "rille" in getattr(data, "attrs", ()),
-        variable: variable in getattr(data, "data_vars", ()),
-    }
-    for what, is_there in there.items():
-        if not is_there:
-            raise InputError("RIL-864", f"the dataset has no {what}", remedy=f"give what {maker} returns")
+    lacking = [] if "rille" in getattr(data, "attrs", ()) else ["attribute rille"]
+    lacking += [] if variable in getattr(data, "data_vars", ()) else [variable]
+    if not lacking:
+        meta = json.loads(data.attrs["rille"])["meta"]
+        lattice = lattice_of(meta)
+        lacking += [] if list(data[variable].dims) == DIMS else [f"{variable} (row, col)"]
+        # Cut, turned or thinned out, the values would be taken for those of other places.
+        places = {} if lattice is None else coordinates(lattice, "")
+        same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
+        lacking += [] if all(same) else ["x and y of all its cells, as they were"]
+    if lacking:
+        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"give what {maker} returns, whole")
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
     # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
     for array in stage.outputs:
@@ -610,14 +616,12 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
             text = f"{array.name} is {given.dtype}, it was {array.dtype}"
             remedy = f"mask it by a whole number, e.g. data.assign({array.name}=data.{array.name}.where(mask, 0))"
             raise InputError("RIL-971", text, remedy=remedy)
-    return Bundle(arrays, json.loads(data.attrs["rille"])["meta"])
+    return Bundle(arrays, meta)
 
 
 def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset:
     """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
     import xarray
-
-    from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 
     variables, lattice = {}, lattice_of(result.meta)
     for name, values in result.arrays.items():

@@ -137,9 +137,9 @@ class Fields:
         """Camera from a 3 x 3 matrix K."""
         k = self.matrix(key, 3, 3)
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]) or abs(k[1, 0]) > 0 or np.abs(k[2] - [0, 0, 1]).max() > 1e-9:
-            raise self.error(
-                "RIL-119", key, f"is {k.tolist()}, no matrix fx 0 cx, 0 fy cy, 0 0 1", "calibrate without skew"
-            )
+            matlab = k[2, 0] and not np.triu(k, 1).any()
+            remedy = "transpose it, and R: MATLAB's multiply rows" if matlab else "calibrate without skew"
+            raise self.error("RIL-119", key, f"is {k.tolist()}, no matrix fx 0 cx, 0 fy cy, 0 0 1", remedy)
         return self.camera(key, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), size)
 
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:

@@ -21,8 +21,11 @@ MOST_VALUES = 100_000
 HEADER = re.compile(r"\A%YAML:[0-9.]+[^\n]*\n(\s*---[^\n]*\n)?")
 """OpenCV's first lines, which no YAML parser accepts."""
 
-END = re.compile(r"^---\s*\Z", re.MULTILINE)
+END = re.compile(r"^---[ \t]*$", re.MULTILINE)
 """What ROS prints behind each message; to YAML a second document begins there."""
+
+STAMPED = re.compile(r"\A\s*header:[ \t]*\n([ \t]+.*\n)*")
+"""What is another one in each message of a topic."""
 
 C_OR_PYTHON: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
@@ -52,7 +55,7 @@ def parse_nested(text: str, file: str) -> Mapping[Any, Any]:
 
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
     """Entries of a YAML or JSON file; empty where it holds something else than entries."""
-    body = END.sub("", HEADER.sub("", text, count=1))
+    body = _first(HEADER.sub("", text, count=1))
     try:
         # Events are flat and cheap: what would be nested or multiplied is seen before anything is built.
         _check_extent(body, file)
@@ -63,6 +66,14 @@ def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
         problem = getattr(error, "problem", None) or "not YAML"
         raise InputError("RIL-141", f"{file} cannot be parsed{where}: {problem}", remedy="correct the file") from error
     return found if isinstance(found, Mapping) else {}
+
+
+def _first(text: str) -> str:
+    """The first of several messages that say the same; the last of them may break off, as printing was ended."""
+    messages = [part for part in END.split(text) if part.strip()]
+    stated = [STAMPED.sub("", message).strip() for message in messages]
+    same = all(stated[0].startswith(others) for others in stated[1:])
+    return text[: text.index(messages[0]) + len(messages[0])] if messages and same else text
 
 
 def _check_extent(text: str, file: str) -> None:

@@ -200,7 +200,8 @@ def usable(header: Header | None, name: str) -> Header:
     if header is None:
         kind = kind_of(name)
         text = f"{name} cannot be read as an image"
-        remedy = f"{COPY_AGAIN}; PNG, JPEG, TIFF and PGM of 8 or 16 bits are read" if kind == "file" else KINDS[kind][1]
+        read = "PNG, JPEG, TIFF and PGM of 8 or 16 bits, grey or RGB with interleaved bands, are read"
+        remedy = f"{COPY_AGAIN}; {read}" if kind == "file" else KINDS[kind][1]
         raise InputError("RIL-171", text, remedy=remedy)
     width, height, bits = header
     if bits > 16:

@@ -40,12 +40,14 @@ def sizes_of(headers: Headers) -> Sizes:
 
 
 def read_header(file: BinaryIO) -> Header | None:
-    """Header of an image file, open at its beginning; None where the file is no PNG, JPEG, TIFF, PGM, PPM or BMP."""
+    """Header of an image file, open at its start; None of what is no PNG, JPEG, TIFF, PGM, PPM or BMP that is read."""
     # Of a damaged header whatever its parser warns of or comes upon: the decoder's refusal then says what is wrong.
     with catch_warnings(action="ignore"), suppress(Exception):
         image = opened(file)
         if image is not None:
             bits = _bits(image)
+            if image.format == "TIFF" and bits > 8 and image.tag_v2.get(284) == 2 and image.tag_v2.get(277, 1) > 1:
+                return None  # bands one behind the other, of which OpenCV would mix the rows
             # Pillow exchanges width and height where a tag says that the image is turned.
             width, height = (image.tag_v2[k] for k in (256, 257)) if image.format == "TIFF" else image.size
             return Header(width, height, 8 if bits <= 8 else 16 if bits <= 16 else bits)

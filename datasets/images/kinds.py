@@ -29,7 +29,7 @@ KINDS: dict[str, tuple[str, str]] = {
         ".webp .jp2 .j2k .pbm .pam .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
         "convert them: magick mogrify -format png FILES",
     ),
-    "image without a header": (
+    "headerless image": (
         ".raw .bin .yuv .bayer",
         "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",
     ),

@@ -28,18 +28,9 @@ SHARE, MOST_APART = 0.25, 0.01
 
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
-    ("cam0", "cam1"),
-    ("cam_0", "cam_1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("image_0", "image_1"),
-    ("image_2", "image_3"),
-    ("image_00", "image_01"),
-    ("image_02", "image_03"),
-    ("infra1", "infra2"),
-    ("im0", "im1"),
-    ("view0", "view1"),
-    ("i1", "i2"),
+    *((f"{name}0", f"{name}1") for name in ("cam", "cam_", "camera", "camera_", "image_", "image_0", "im", "view")),
+    *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
+    *((f"{name}1", f"{name}2") for name in ("infra", "i")),
     ("l", "r"),
 )
 """Tokens that name the left and the right camera in file and folder names, the surest first."""
@@ -179,9 +170,10 @@ def ends(paths: Sequence[Path]) -> str:
 
 
 def _token(word: str) -> re.Pattern[str]:
-    """A side's token; a single letter must stand alone, ``left`` must not be part of a longer word."""
+    """A side's token, which must not be part of a longer word; capitals begin one: ``imgL``, ``leftImg``."""
     digits = r"(?!\d)" if word[-1].isdigit() else ""
-    return re.compile(rf"(?<![a-z]){re.escape(word)}(?![a-z]){digits}", re.IGNORECASE)
+    small, capitals = rf"(?<![A-Za-z]){word}(?![a-z])", rf"(?<![A-Z]){word.upper()}(?![A-Za-z])"
+    return re.compile(rf"({small}|(?<![A-Z]){word.capitalize()}(?![a-z])|{capitals}){digits}")
 
 
 TOKENS = tuple(tuple(_token(word) for word in sides) for sides in SIDES)
@@ -207,6 +199,22 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
     return [(of[0], of[1]) for of in sides.values() if len(of) == 2]
 
 
+def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
+    """Places of the names by the one word, of two, that parts them into pairs which are alike but for it (A/07, B/07).
+
+    In natural order of the words; nothing where no word does so, or more than one.
+    """
+    found = []
+    words = [re.split(r"([^\W_]+)", name) for name in names]
+    for k in range(1, min(map(len, words), default=0), 2):
+        kinds = sorted({split[k] for split in words}, key=natural)
+        parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
+        rest = [{tuple(words[i][:k] + words[i][k + 1 :]) for i in of} for of in parts.values()]
+        if len(kinds) == 2 and rest[0] == rest[1] and len(rest[0]) > 1:
+            found.append(parts)
+    return found[0] if len(found) == 1 else {}
+
+
 def without_side(stem: str, side: int) -> str:
     """A file's stem without its side's token: ``cam_left_07`` and ``cam_right_07`` are both ``cam_*_07``."""
     found = side_of(stem)
@@ -228,9 +236,9 @@ def pair_up(
     Parameters
     ----------
     left, right : image files of each camera.
-    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem), ``nearest`` (time
-        stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest where time stamps
-        differ, and number where the names of the two cameras have nothing in common.
+    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which all differ),
+        ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest
+        where time stamps differ, and number where the names of the two cameras have nothing in common.
     gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
         are fewer than the whole pairs.
     growing : images behind the last pair, by name or number, are left out: their partners are still to come.
@@ -290,15 +298,17 @@ def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
 
 
 def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
-    """Images by what those of a pair share: their name without the side's token, or its last number."""
+    """Images by what those of a pair share: their name without the side's token, or its number."""
     by_key: dict[str, Path] = {}
-    for path in paths:
-        numbers = re.findall(r"\d+", path.stem)
+    found = [re.findall(r"\d+", path.stem)[::-1] for path in paths]
+    # The last number that no two names share; behind it may stand that of a camera, or of a file's version.
+    last = next((k for k, of in enumerate(zip(*found, strict=False)) if len(set(of)) == len(paths)), 0)
+    for path, numbers in zip(paths, found, strict=True):
         if rule == "number" and not numbers:
             text = f"{path} has no number in its name and no partner of its name"
             remedy = 'rename the images, or narrow the patterns; a manifest may take them by images.pair = "order"'
             raise InputError("RIL-257", text, remedy=remedy)
-        key = str(int(numbers[-1])) if rule == "number" else without_side(path.stem, side)
+        key = str(int(numbers[last])) if rule == "number" else without_side(path.stem, side)
         if key in by_key:
             text = f"{by_key[key]} and {path} are the same frame by {rule}"
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")

@@ -88,8 +88,8 @@ def _tags(source: Source) -> tuple[int, bool]:
     ):
         turned, size = orientation(image), image.size
         image.seek(1)
-        # TIFF's tag of images that are a smaller copy, or a mask, of another one
-        several = image.size == size and not getattr(image, "tag_v2", {}).get(254, 0)
+        # TIFF's tag of an image that is a smaller copy (1) or a mask (4) of another one; pages of a stack have 2
+        several = image.size == size and not getattr(image, "tag_v2", {}).get(254, 0) & (1 | 4)
     return turned, several
 
 

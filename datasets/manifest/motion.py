@@ -243,12 +243,14 @@ class MotionReader:
 
         Raises
         ------
-        IncompleteError
-            They or the pairs have no times, and they are not one a pair.
+        InputError
+            Both have times, and none in common; or not both have, and they are not one a pair.
         """
         self.warn(found.warnings)
         if found.times is not None and self.sequence.times is not None:
-            return found.positions, tuple(t + section.time_offset for t in found.times)
+            times = tuple(t + section.time_offset for t in found.times)
+            refuse_apart(times, self.sequence.times, found.name)
+            return found.positions, times
         rows = tuple(self.arrived(found.positions))
         if len(rows) != len(self.pairs):
             text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
@@ -269,8 +271,6 @@ class MotionReader:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
         rows, times = self.positions(section, found, "positions")
-        if times is not None and self.sequence.times is not None:
-            refuse_apart(times, self.sequence.times, found.name)
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
         measured = {
             "positions": [list(row) for row in rows],

@@ -214,8 +214,8 @@ def find_pairs(
         for path in paths:
             writable(path.name)
         if not paths:
-            text = f"{name}: images.{side} = {pattern!r} finds no file in {root}"
-            raise IncompleteError("RIL-217", text, remedy="correct the pattern or root")
+            text = "; ".join([f"{name}: images.{side} = {pattern!r} finds no file in {root}", *search.closed[:1]])
+            raise IncompleteError("RIL-217", text, remedy="correct the pattern, root or rights")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:

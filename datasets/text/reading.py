@@ -13,7 +13,6 @@ import stat
 import tomllib
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
-from contextlib import suppress
 from io import BufferedReader
 from itertools import islice, pairwise
 from pathlib import Path
@@ -218,13 +217,18 @@ def _no_long_line(lines: list[str], path: Path, what: str) -> None:
 
 
 class Search:
-    """Looks into folders, at no more than ``MOST_ENTRIES`` files and folders in all."""
+    """Looks into folders, at no more than ``MOST_ENTRIES`` files and folders in all.
+
+    Attributes
+    ----------
+    closed : a line on each folder that is there and could not be read.
+    """
 
     def __init__(self) -> None:
-        self._seen = 0
+        self._seen, self.closed = 0, list[str]()
 
     def entries(self, folder: Path) -> list[os.DirEntry[str]]:
-        """Entries of a folder in order of name; none where it may not be read.
+        """Entries of a folder in order of name; none where it cannot be read.
 
         Raises
         ------
@@ -232,8 +236,13 @@ class Search:
             There are more than may be looked at.
         """
         found: list[os.DirEntry[str]] = []
-        with suppress(OSError, ValueError), os.scandir(folder) as there:
-            found = sorted(islice(there, MOST_ENTRIES - self._seen + 1), key=lambda entry: entry.name)
+        try:
+            with os.scandir(folder) as there:
+                found = sorted(islice(there, MOST_ENTRIES - self._seen + 1), key=lambda entry: entry.name)
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            pass
+        except OSError as error:  # of another user, or on a network drive that is gone
+            self.closed.append(f"folder {folder} cannot be read: {error.strerror}")
         self._seen += len(found)
         if self._seen > MOST_ENTRIES:
             text = f"more than {MOST_ENTRIES} files and folders to look at, so far as {folder}"

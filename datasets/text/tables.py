@@ -192,7 +192,9 @@ def read_table(path: Path, what: str) -> TextTable:
         rows.append(row)
         at.append(k)
     if not rows:
-        raise InputError("RIL-286", f"{what} {path} has no rows of numbers", remedy="check that it is the right file")
+        last = next((f"; its last line is {line[:60]!r}" for line in reversed(lines) if line.strip()), "")
+        text = f"{what} {path} has no rows that begin with a number{last}"
+        raise InputError("RIL-286", text, remedy="check that it is the right file; dates are as 2026-05-31 12:00:00")
     header = split(names, separator, columns)
     header = header if len(header) == columns else ()
     if len(units) == columns:

@@ -80,7 +80,8 @@ def seconds(
         if times[k] <= times[k - 1]:
             words = "is there twice" if times[k] == times[k - 1] else f"goes back from {exact[k - 1]}"
             text = f"{what}, line {at[k]}: time {exact[k]} {words}"
-            raise InputError("RIL-293", text, remedy="put the rows in order of time, each once, in one unit")
+            remedy = "put the rows in order of time, each once, in one unit and with all digits"
+            raise InputError("RIL-293", text, remedy=remedy)
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
     # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
     # likelier, and no camera takes ten million images a second.

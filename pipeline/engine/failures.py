@@ -20,7 +20,7 @@ def translated(error: BaseException) -> RilleError | None:
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         kind = ConfigError if error.errno == errno.ENAMETOOLONG else RilleError
-        return kind("RIL-737", f"{where}{error.strerror}", remedy=_remedy(error.errno))
+        return kind("RIL-737", f"{where}{error.strerror}", remedy=remedy_of(error.errno))
     library = type(error).__module__.split(".")[0]
     if library == "cv2":
         return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")
@@ -29,11 +29,12 @@ def translated(error: BaseException) -> RilleError | None:
     return None
 
 
-def _remedy(number: int) -> str:
+def remedy_of(number: int) -> str:
+    """What to change where the system refused with this number (:mod:`errno`)."""
     if number in FULL:
         return "free space, clear the cache, or choose another place with --output, --runs or --cache"
     if number in CLOSED:
-        return "choose a place that may be written with --output, --runs or --cache"
+        return "check its rights, or choose a place that may be written with --output, --runs or --cache"
     if number == errno.ENAMETOOLONG:
         return "give a shorter name"
     return "check the path; the same command resumes from here"

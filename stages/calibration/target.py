@@ -145,7 +145,10 @@ def calibrate_rig(
 
 
 def check_sides(rig: RigCalibration) -> None:
-    """Refuse cameras of which the right one stands on the left one's left (RIL-310); only views that fit tell that."""
+    """Refuse a right camera on the left one's left, or in its place (by four sigma); only views that fit tell that."""
+    if rig.values["baseline"] < 4 * rig.sigma["baseline"]:
+        text = f"both cameras stand in one place: the baseline is {rig.values['baseline']:.2g} m"
+        raise InputError("RIL-313", text, remedy="give images of two cameras: are left and right those of one?")
     centre = rig.T_right_left.inverse().translation
     if centre[0] < -SWAPPED * float(np.linalg.norm(centre)):
         text = f"the right camera stands {-centre[0]:.4g} m to the left of the left one"

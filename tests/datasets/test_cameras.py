@@ -191,6 +191,11 @@ def test_ros_message_as_echo_prints_it_says_what_the_file_says(tmp_path, capital
     assert found.lens.coefficients == expected.lens.coefficients
     assert found.lens.camera.matrix.tolist() == [[500, 0, 320], [0, 501, 240], [0, 0, 1]]
     assert found.T_camera_reference.to_list() == expected.T_camera_reference.to_list()
+    stamped = [f"header:\n  stamp:\n    sec: {k}\n" + text.removeprefix("header:\n") for k in range(3)]
+    several = written(tmp_path, "".join(stamped)[:-120], "several.yaml")  # printing was ended within the last one
+    assert read_cameras(several)[0].lens == found.lens
+    with raises("RIL-141", "another document"):
+        read_cameras(written(tmp_path, text + text.replace("501.0", "502.0"), "unlike.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -613,7 +618,13 @@ def test_middlebury_is_in_millimetres(tmp_path):
         ("1 THIN_PRISM 640 480 500\n", ("RIL-108", "THIN_PRISM")),
         (MONO.format(count=4, values="[0, 0, 0, .nan]"), ("RIL-121", "distortion_coefficients")),
         (MONO.format(count=6, values=[0.1] * 6), ("RIL-370", "distortion_coefficients")),
-        (MONO.format(count=4, values=[0.1] * 4).replace("[ 5.e+02, 0.,", "[ 5.e+02, 3.,"), ("RIL-119",)),
+        (MONO.format(count=4, values=[0.1] * 4).replace("[ 5.e+02, 0.,", "[ 5.e+02, 3.,"), ("RIL-119", "without skew")),
+        (
+            MONO.format(count=4, values=[0.1] * 4).replace(
+                "0., 3.2e+02, 0., 5.01e+02, 2.4e+02, 0., 0.", "0., 0., 0., 5.01e+02, 0., 320, 240"
+            ),
+            ("RIL-119", "transpose it"),
+        ),
         (MONO.format(count=4, values=[0.1] * 4).replace("image_height: 480\n", ""), ("RIL-113", "image_height")),
         (CAMODOCAL.format(kind="MEI", mirror="mirror_parameters: {xi: 1.9}\n", projection=USUAL), ("RIL-814", "MEI")),
         (CAMODOCAL.format(kind="SCARAMUZZA", mirror="", projection=USUAL), ("RIL-814", "SCARAMUZZA")),

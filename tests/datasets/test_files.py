@@ -27,6 +27,20 @@ def encoded(image, kind=".png") -> bytes:
     return cv2.imencode(kind, image)[1].tobytes()
 
 
+def test_bands_of_sixteen_bits_in_planes_are_refused_and_others_read(tmp_path, grey):
+    import rasterio
+
+    shape = {"driver": "GTiff", "count": 3, "width": 50, "height": 40, "photometric": "RGB"}
+    for dtype, kind in (("uint16", "band"), ("uint16", "pixel"), ("uint8", "band")):
+        with rasterio.open(tmp_path / "x.tif", "w", dtype=dtype, interleave=kind, **shape) as file:
+            file.write(np.stack([grey] * 3).astype(dtype))
+        if (dtype, kind) == ("uint16", "band"):
+            with raises("RIL-171", "interleaved"):
+                files.read_grey(tmp_path / "x.tif")
+        else:
+            np.testing.assert_array_equal(files.read_grey(tmp_path / "x.tif"), grey)
+
+
 @pytest.mark.parametrize("kind", [".png", ".tif", ".pgm"])
 def test_lossless_kinds_round_trip(tmp_path, grey, kind):
     for image in (grey, grey.astype(np.uint16) * 257):

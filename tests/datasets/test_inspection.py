@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tomllib
 from pathlib import Path
 
@@ -71,6 +73,41 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     views = inspect(tmp_path).views
     assert (views.left, views.right, views.pairs, views.trouble) == (left, right, pairs, "")
     assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "patterns"),
+    [
+        ("A/{}.png", "B/{}.png", ("A/*.png", "B/*.png")),
+        ("cam1/{}.png", "cam2/{}.png", ("cam1/*.png", "cam2/*.png")),
+        ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
+        ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
+    ],
+)
+def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, left, right, patterns):
+    write_images(tmp_path, [name.format(k) for k in (1, 2, 3) for name in (left, right)])
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    found = inspect(tmp_path)
+    assert (found.views.pairs, found.views.trouble) == (3, "")
+    assert patterns in (None, (found.views.left, found.views.right))
+    text = manifest_text(found, ".")
+    assert "are taken for the left and the right camera, in order" in text
+    path = tmp_path / "m.rille.toml"
+    path.write_text(text)
+    assert open_manifest(path, Digests()).frames == 3
+
+
+def test_names_that_differ_in_several_ways_tell_no_cameras_apart(tmp_path):
+    write_images(tmp_path, [f"run{k}/cam_{c}.png" for k in (1, 2) for c in "ab"])
+    with raises("RIL-194"):
+        inspect(tmp_path)
+
+
+def test_a_counter_that_began_anew_is_no_reason_to_pair_by_time_stamps(tmp_path):
+    write_images(tmp_path, both("{side}/img{name}.png", ["998", "999", "000", "001"]))
+    text = manifest_text(inspect(tmp_path), ".")
+    assert "began anew" in text
+    assert "pair" not in tomllib.loads(text)["images"]
 
 
 def test_names_that_are_time_stamps(tmp_path):
@@ -401,7 +438,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "1 bag (drive.bag)",
     ):
         assert words in text
-    assert "1 image without a header (r.raw): " in text
+    assert "1 headerless image (r.raw): " in text
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
     assert len(found.unread) == 8
@@ -441,6 +478,26 @@ def test_folders_that_are_links_are_looked_into_once(tmp_path):
         (tmp_path / "here" / "deep" / side).symlink_to(tmp_path / "here")
     found = inspect(tmp_path / "here").views
     assert (found.left, found.right, found.pairs) == ("left/*.png", "right/*.png", 2)
+
+
+@pytest.mark.parametrize("error", [PermissionError(errno.EACCES, "Permission denied"), OSError(errno.ENOTCONN, "gone")])
+def test_a_folder_that_cannot_be_read_is_not_said_to_hold_nothing(tmp_path, monkeypatch, error):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
+    path = tmp_path / "m.rille.toml"
+    path.write_text(manifest_text(inspect(tmp_path), "."))
+    scan = os.scandir
+
+    def closed(place):
+        if Path(place).name == "right":
+            raise error
+        return scan(place)
+
+    monkeypatch.setattr(os, "scandir", closed)
+    with raises("RIL-194", f"right cannot be read: {error.strerror}"):
+        inspect(tmp_path)
+    with raises("RIL-217", f"right cannot be read: {error.strerror}"):
+        open_manifest(path, Digests())
 
 
 def test_what_archives_of_a_mac_add_is_passed_over(tmp_path):

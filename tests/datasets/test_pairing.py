@@ -110,6 +110,9 @@ def test_numbers_in_names_sort_as_numbers():
         ("left/left_3", (0, "*/*_3")),
         ("x_R_4", (1, "x_*_4")),
         ("image_2/000", (0, "*/000")),
+        ("imgL_07", (0, "img*_07")),
+        ("rightImg8bit/3", (1, "*Img8bit/3")),
+        ("frameLeft3", (0, "frame*3")),
     ],
 )
 def test_tokens_of_sides(name, side):
@@ -118,7 +121,7 @@ def test_tokens_of_sides(name, side):
     assert at[1:] == side
 
 
-@pytest.mark.parametrize("name", ["leftover", "cam01/3", "aright", "real", "image_25/3", "123"])
+@pytest.mark.parametrize("name", ["leftover", "cam01/3", "aright", "real", "image_25/3", "123", "COLOR/3", "Large"])
 def test_words_that_only_look_like_a_side(name):
     assert side_of(name) is None
 

@@ -66,6 +66,13 @@ def test_moments_in_which_a_tracker_has_lost_its_target_are_left_out(tmp_path):
     assert "2 rows of 4" in found.warnings[0]
 
 
+def test_names_in_a_bracket_that_commas_part_tell_the_order_of_a_quaternion(tmp_path):
+    names = "# stamp, translation (t_x, t_y, t_z), rotation quaternion (q_x, q_y, q_z, q_w), scale\n"
+    found = read(tmp_path, names + f"5,1,2,3,0,0,{H},{H},1\n")
+    assert found.times == (5.0,)
+    np.testing.assert_allclose(found.poses[0].matrix34, np.column_stack([TURN, [1, 2, 3]]), atol=1e-12)
+
+
 @pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)])
 def test_the_name_of_a_column_states_the_unit_of_its_times(tmp_path, name, factor):
     found = read(tmp_path, f"{name},qw,qx,qy,qz\n0,1,0,0,0\n100,1,0,0,0\n")
@@ -109,6 +116,7 @@ def test_angles_beyond_a_turn_can_only_be_degrees(tmp_path):
         ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 2 0 0 0 0 2 0\n", "kitti", ("RIL-333", "line 2")),
         ("1 2 3 4\n", "auto", ("RIL-264", "4 numbers")),
         ("time,v,omega\n0,1,2\n", "auto", ("RIL-264", "time, v, omega")),
+        ("t,m00,m01,m02,m03,m10,m11,m12,m13\n0,1,0,0,0,0,1,0,0\n", "auto", ("RIL-264", "m00", "state the format")),
         ("1 2 3 4\n", "kitti", ("RIL-267",)),
         ("1 2 3 4\n", "csv", ("RIL-264",)),
         ("1 2 3 4\n", "bag", ("RIL-264", "bag")),

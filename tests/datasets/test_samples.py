@@ -135,5 +135,8 @@ def test_files_that_hold_several_images_are_refused(tmp_path):
     images[0].save(tmp_path / "left" / "00.tif", save_all=True, append_images=images[1:])
     with raises("RIL-831", "several images"):
         open_sequence(str(path))
+    cv2.imwritemulti(str(tmp_path / "left" / "00.tif"), [np.full((48, 64), k, np.uint8) for k in (90, 120)])
+    with raises("RIL-831", "several images"):  # whose directories call them pages
+        open_sequence(str(path))
     images[0].save(tmp_path / "left" / "00.tif", save_all=True, append_images=[Image.new("L", (32, 24))])
     assert open_sequence(str(path)).frames == 1  # a preview

@@ -74,7 +74,7 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
         ("1,2,3\n4,nan,6\n", ("RIL-284", "t.csv", "line 2", "'nan'")),
         ("1,2,3\n4,-1e300,6\n", ("RIL-284", "t.csv", "line 2", "'-1e300'")),
         ("time,x\n", ("RIL-286", "t.csv")),
-        ("time,x\n2020-09-13,1\n", ("RIL-286", "t.csv")),
+        ("time,x\n2020-09-13,1\n", ("RIL-286", "t.csv", "'2020-09-13,1'")),
     ],
 )
 def test_what_is_wrong_names_the_line(tmp_path, text, expected):

@@ -188,8 +188,13 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
     ):
         with raises("RIL-864", maker):
             step(other)
+    for changed in (dem.isel(row=slice(20, None)), dem.sortby("y"), dem.transpose(), dem.thin(col=2)):
+        with raises("RIL-864", "rille.terrain returns, whole"):
+            rille.hazards(changed)
     with raises("RIL-674", "rille.open(...)[0]"):
         rille.terrain(disparity, pair.sequence)
+    with pytest.raises(TypeError, match="Dataset"):
+        rille.match(disparity, pair.right)
     with raises("RIL-675", "left.png"):
         rille.match("left.png", pair.right)
     with raises("RIL-865", "(260, 285)"):

@@ -110,7 +110,7 @@ def calibrate(
     chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
     pictures = _files(left, right)
     try:
-        pairs = pairing.pair_up(*pictures)
+        pairs = pairing.pair_up(*pictures, gaps=True)
     except InputError as error:  # its remedies are keys of a manifest
         remedy = "give both pictures of a pair one name or number, each side in a folder or glob of its own"
         raise InputError(error.code, error.message, remedy=remedy) from error
@@ -160,14 +160,16 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     InputError
         An image cannot be read, or too few pairs show a board of one size.
     """
-    images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in pairs}
+    whole = [p for p in pairs if not p.absent]
+    images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in whole}
     sizes = {name: tuple(image.shape[::-1] for image in both) for name, both in images.items()}
     # One picture of another size is a slip; the others still calibrate.
     usual: Any = Counter(sizes.values()).most_common(1)[0][0]
     if corners is None:
         corners = chessboard.find_size(image for name in images if sizes[name] == usual for image in images[name])
     out = Boards(corners, usual)
-    out.left_out = [(name, why) for name, both in images.items() if (why := out.take(name, both))]
+    alone = [(p.name, p.absent) for p in pairs if p.left.exists() != p.right.exists()]
+    out.left_out = alone + [(name, why) for name, both in images.items() if (why := out.take(name, both))]
     if out.left_out and len(out.views) < LEAST_VIEWS:
         raise InputError(
             "RIL-961",

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rille.datasets.text import reading
-from rille.pipeline.engine.failures import CLOSED, FULL
+from rille.pipeline.engine.failures import CLOSED, FULL, remedy_of
 from rille.stages.core.errors import ConfigError, RilleError
 
 RACY_S = 0.1
@@ -46,8 +46,7 @@ def clear_errors(root: Path) -> Iterator[None]:
         if error.errno not in (*FULL, *CLOSED, errno.ENOTDIR):
             raise
         text = f"the cache {root} cannot be used ({os.strerror(error.errno)})"
-        remedy = "free space, clear the cache, or choose another folder with --cache"
-        raise StoreError("RIL-575", text, remedy=remedy) from error
+        raise StoreError("RIL-575", text, remedy=remedy_of(error.errno)) from error
 
 
 def touch(path: str) -> None:

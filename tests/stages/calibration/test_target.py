@@ -226,6 +226,10 @@ def test_what_cannot_be_calibrated_says_so():
     swapped = [BoardView(v.name, v.right, v.left) for v in views]
     with raises("RIL-310"):
         check_sides(calibrate_rig(BOARD, swapped, SIZES, "radtan4"))
+    noise = scene("radtan4", 6, noise=0.1)
+    twice = [BoardView(v.name, v.left, v.left + 0.01 * (w.left - v.left)) for v, w in zip(views, noise, strict=True)]
+    with raises("RIL-313", "one place"):
+        check_sides(calibrate_rig(BOARD, twice, (SIZES[0], SIZES[0]), "radtan4"))
 
 
 def test_a_right_camera_upside_down_stands_where_it_stands():

@@ -243,3 +243,12 @@ def test_unrelated_photographs_match_hardly_anywhere(data_dir):
     rows, cols = cones.shape
     for row, col in ((0, 0), (60, 140), (120, 280)):
         assert matched(match(cones, motorcycle[row : row + rows, col : col + cols]).validity).mean() < MOST_CHANCE
+
+
+def test_strips_of_few_rows_that_are_turned_are_matched_at_the_levels_that_they_have():
+    rng = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(rng.integers(0, 256, (60, 500)).astype(np.uint8), (0, 0), 1.5)
+    scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
+    turned = cv2.warpAffine(scene, cv2.getRotationMatrix2D((200, 30), 4, 1.0), (500, 60))
+    strip = np.s_[20:40, 40:440]
+    assert matched(match(scene[strip], turned[strip]).validity).mean() > 0.3
