@@ -84,7 +84,7 @@ def recorded(names: list[str], folder: Path, *, outputs: bool = True) -> list[Ta
     for name in names:
         sequence, verb, given = RUNS[name]
         where = {"runs": folder / "runs", "cache": folder / "cache"}
-        opened = session._open(sequence, session.Options(given, executor="inline", **where), verb, "", print)
+        opened = session._open(sequence, session.Options(given, executor="inline", **where), verb, print)
         if outputs:
             opened.graph.last = lambda opened=opened: run_files.lay_out(opened.graph, opened.late(), {})
         driver.run(opened.graph, opened.store, driver.RunOptions(executor="inline")).check()

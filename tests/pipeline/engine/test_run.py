@@ -216,7 +216,7 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
     assert (result.counts["computed"], result.counts["failed"], result.counts["skipped"]) == (3, 2, 4)
     rows = ledger.read(file)
     assert sorted(r["label"] for r in rows) == sorted(h.label for h in graph.nodes)
-    assert ledger.keys(file) == {h.key for h in graph.nodes if h.done}
+    assert {r["key"] for r in rows if r["status"] == "computed"} == {h.key for h in graph.nodes if h.done}
     assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
 
 

@@ -82,7 +82,7 @@ def clear(cache, runs, until, grace):
     while not Path(until).exists():
         kept = set()
         for path in Path(runs).glob("*/*/ledger.jsonl"):
-            kept |= ledger.keys(path)
+            kept |= {row["key"] for row in ledger.read(path) if row["status"] in ("computed", "cached")}
         cleared = maintenance.gc(Store(cache), kept, grace=grace)
         removed += sum(len(sizes) for stage, sizes in cleared.items() if stage)
         times += 1
