@@ -340,4 +340,4 @@ def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = No
     coarse = Coarse(images, descend(images, COARSE_LEVEL), images.right, prior=prior)
     for step in images.params.kept((even, known, align, turn)):
         coarse = step(coarse)
-    return replace(coarse, state=descend(coarse.images, 1, coarse.state))
+    return replace(coarse, state=descend(coarse.images, 1, coarse.state, coarse.state.near_sign))

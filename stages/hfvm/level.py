@@ -228,8 +228,11 @@ def edges(look: Look, field: Field) -> Field:
 
 
 def match_level(images: PyramidPair, level: int, above: State | None, near_sign: float = 0.0) -> State:
-    """The state of a level, from that of the level above (None: the top): search, propagate, check, band."""
-    known, rounds = near_sign if above is None else above.near_sign, images.recipe.rounds
+    """The state of a level, from that of the level above (None: the top): search, propagate, check, band.
+
+    ``near_sign``: sign of depth that is known beforehand, as of aligned images, which do not tell it; 0: it is not.
+    """
+    known, rounds = near_sign or (0.0 if above is None else above.near_sign), images.recipe.rounds
     back = None if above is None else above.reverse()
     ahead = partial(one_way, images, level, above, known, rounds[0])
     left, right = side_by_side(
@@ -237,7 +240,7 @@ def match_level(images: PyramidPair, level: int, above: State | None, near_sign:
     )
     a, b = images.left.layers[level].valid, images.right.layers[level].valid
     ok = agree(left, right, a, b, images.params.backmatch), agree(right, left, b, a, images.params.backmatch)
-    return with_band(images, State(level, left, right, *ok, FREE_BAND, known), above)
+    return with_band(images, State(level, left, right, *ok, FREE_BAND, known), None if near_sign else above)
 
 
 def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
@@ -305,7 +308,10 @@ def sample(images: PyramidPair, state: State) -> Sample:
 
 
 def with_band(images: PyramidPair, state: State, above: State | None) -> State:
-    """The state with the epipolar band for the next finer level, where there is one and it can be fitted."""
+    """The state with the epipolar band for the next finer level, where there is one and it can be fitted.
+
+    ``above``: the state whose sign of depth is looked for anew where lines turn out to run the other way.
+    """
     if images.params.band == 0 or state.level == 0:
         return state
     s, shapes = sample(images, state), (state.left.u.shape, state.right.u.shape)

@@ -62,6 +62,24 @@ def test_lines_are_fitted_to_what_shows_something():
     assert np.median(found.v) == pytest.approx(4.5, abs=0.1)
 
 
+@pytest.mark.parametrize(("given", "kept"), [(1.0, 1.0), (0.0, -1.0)])
+def test_a_sign_of_depth_that_is_given_stays_where_lines_seem_to_turn(monkeypatch, given, kept):
+    """Aligned images do not tell the sign, and a coarse level's lines may seem to run along the columns."""
+    fit = epipolar.fit_points
+
+    def turned_at_the_top(*matches):
+        found = fit(*matches)
+        return found if min(matches[-1]) > 50 else (epipolar.transposed(found[0]), found[1])
+
+    monkeypatch.setattr(epipolar, "fit_points", turned_at_the_top)
+    left, right, _, _ = pair(lambda x, y: (-14 + 4 * np.sin(x / 25) * np.sin(y / 30), 0 * x), SHAPE)
+    images = PyramidPair(
+        *(as_matched(build(a, PyramidParams()), HfvmParams()) for a in (left, right)), HfvmParams(), DEFAULT
+    )
+    assert descend(images, 2, None, given).upright == (min(images.left.layers[2].shape) <= 50)
+    assert descend(images, 1, None, given).near_sign == kept
+
+
 def on_plane(h, share=1.0, level=2):
     """Matches of a level, a ``share`` of them on the plane of a homography of full resolution; and shapes of levels."""
     h, shape, rng = np.linalg.inv(plane.finer(level)) @ h @ plane.finer(level), (50, 60), np.random.default_rng(5)
