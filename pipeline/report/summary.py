@@ -194,22 +194,22 @@ MAX_SIGMA_RATIO = 3.0
 def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     """The standard deviations of the poses are not to be weighed by, where truth says so."""
     off = {}
-    for what in ("positions", "rotations"):
-        nees = _value(figures, f"trajectory_nees_{what[:-1]}")
+    for part in ("position", "rotation"):
+        nees = _value(figures, f"trajectory_nees_{part}")
         if nees is not None and nees > MAX_SIGMA_RATIO**2:
-            off[what] = f"{what} by about {number(math.sqrt(nees), 2)} times"
+            off[part] = f"{part}s by about {number(math.sqrt(nees), 2)} times"
     if not off:
         return []
-    map_too = (
-        "; what the merged map says of σ and of the probability of a hazard holds for the shape of the ground, not for "
-        "its place"
-    )
-    return [
+    line = (
         f"the poses are off the truth, {' and '.join(off.values())} their standard deviations: these are too small, or "
         "the truth has a turn or errors of its own; until that is known do not weigh by them"
-        + map_too
-        * ("positions" in off)
-    ]
+    )
+    if "position" in off:
+        line += (
+            "; what the merged map says of σ and of the probability of a hazard holds for the shape of the ground, not "
+            "for its place"
+        )
+    return [line]
 
 
 def resting(view: RunView) -> list[str]:
