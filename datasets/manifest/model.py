@@ -330,10 +330,14 @@ class Truth(PoseFile):
         and y span the ground, y left of x seen from above, z is up; names that are clear need none.
     lever_arm : m; where the antenna or prism of positions alone is in the left camera's frame: x right, y down, z
         ahead; none: fitted where turns show it, and the report says so.
+    sigma_m : m; standard deviation of true positions along each axis; stated covariances are judged together with it.
+    sigma_deg : degrees; that of true rotations about each axis.
     """
 
     columns: Columns = Field(default={})
     lever_arm: Vector | None = None
+    sigma_m: Deviation | None = None
+    sigma_deg: Deviation | None = None
 
 
 class Attitude(Poses):

@@ -213,7 +213,8 @@ class MotionReader:
             text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
         mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        self.state(truth=self.poses(section, "truth"), truth_mount=mount)
+        sigma = (section.sigma_m or 0.0, math.radians(section.sigma_deg or 0.0))
+        self.state(truth=self.poses(section, "truth"), truth_mount=mount, truth_sigma=sigma)
 
     def odometry(self, section: Odometry) -> None:
         """Dead reckoning, which is a measurement where it says how good it is."""
@@ -227,6 +228,11 @@ class MotionReader:
         if section.T_body_left is not None:
             text = f"{self.name}: truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
             raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
+        if (section.sigma_m or section.sigma_deg) is not None:
+            text = (
+                f"{self.name}: truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
+            )
+            raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
         spacing = float(np.median(np.diff(times))) if times is not None and len(times) > 1 else 0.0
         if spacing > section.max_gap:

@@ -202,7 +202,8 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
         return []
     line = (
         f"the poses are off the truth, {' and '.join(off.values())} their standard deviations: these are too small, or "
-        "the truth has a turn or errors of its own; until that is known do not weigh by them"
+        "the truth has a turn or errors of its own, beyond what truth.sigma_m and sigma_deg state; until that is known "
+        "do not weigh by them"
     )
     if "position" in off:
         line += (

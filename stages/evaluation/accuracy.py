@@ -9,7 +9,8 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 * drift: error of the last position after making the first poses equal, over the true length of the path;
 * scale: least-squares factor between the lengths of the motions of successive frames;
 * NEES: mean squared error over the claimed one, per degree of freedom: 1 where the claims are right; of whole poses,
-  of positions and of rotations, since a truth may be good in one and poor in the other.
+  of positions and of rotations, since a truth may be good in one and poor in the other. Errors of the truth itself,
+  where they are stated, are added to what is claimed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from rille.stages.evaluation.conventions import better_reading
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
-from rille.stages.geometry.geometry import RigidTransform, rotation_log
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_log
 from rille.stages.geometry.rigid import posed, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -41,7 +42,7 @@ CLAIMS = (
 
 
 def trajectory_accuracy(
-    estimate: Floats, truth: Floats, covariance: Floats | None = None
+    estimate: Floats, truth: Floats, covariance: Floats | None = None, sigma: Sequence[float] = (0.0, 0.0)
 ) -> tuple[dict[str, Floats], dict[str, Metric]]:
     """Compare an estimated trajectory with the true one.
 
@@ -51,6 +52,7 @@ def trajectory_accuracy(
     truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
     covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see
     :mod:`rille.stages.odometry.resection.resect`.
+    sigma : standard deviations of the true positions (m) and of the true rotations (rad), about each axis.
 
     Returns
     -------
@@ -73,8 +75,11 @@ def trajectory_accuracy(
         figures["drift"] = metric("fewer than two frames have a pose and truth", "%", "")
     if covariance is not None and len(judged) > 1:
         how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
+        if any(sigma):
+            how += f"; with {sigma[0]:g} m and {math.degrees(sigma[1]):g} degrees of the truth itself"
+        total = covariance + _of_truth(aligned, aligned[start], sigma)
         for name, part, whose in CLAIMS:
-            figures[name] = metric(nees(estimate, aligned, covariance, part), "", how + whose)
+            figures[name] = metric(nees(estimate, aligned, total, part), "", how + whose)
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
 
 
@@ -139,6 +144,16 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     return {"scale_error": metric(100.0 * (scale - 1.0), "%", how)}
 
 
+def _of_truth(aligned: Floats, first: Floats, sigma: Sequence[float]) -> Floats:
+    """Covariances (n, 6, 6) of (position m, rotation rad) of true poses (n, 3, 4) that were made equal to ``first``.
+
+    Each true pose has errors of its own; those of the first one move all others, and turn them about it.
+    """
+    own, moved = np.diag(np.repeat(np.square(sigma), 3)), np.tile(np.eye(6), (len(aligned), 1, 1))
+    moved[:, :3, 3:] = -cross_matrix(aligned[:, :, 3] - first[:, 3])
+    return own + moved @ own @ np.swapaxes(moved, 1, 2)
+
+
 def nees(P: Floats, aligned: Floats, covariance: Floats, part: slice = slice(0, 6)) -> float | str:
     """Mean squared error over the claimed one, per degree of freedom; or why it does not apply.
 
@@ -167,7 +182,7 @@ def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
 
 @stage(
     "accuracy",
-    version=6,
+    version=7,
     outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
         Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
@@ -180,18 +195,19 @@ def accuracy_stage(
     frames: list[int],
     truth: Sequence[Sequence[float] | None],
     mount: RigidTransform | None = None,
+    sigma: Sequence[float] = (0.0, 0.0),
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES."""
     given, true = trajectory.meta["frames"], pose_rows(truth)
     estimate, claimed = rigid.by_frame(world_poses(trajectory), given, frames), None
     if "covariance" in trajectory.arrays:
         claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, frames)
-    arrays, figures = trajectory_accuracy(estimate, true, claimed)
+    arrays, figures = trajectory_accuracy(estimate, true, claimed, sigma)
     facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
-        sigma = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
-        warnings = better_reading(estimate[both], true[both], mount or RigidTransform.identity(), sigma)
+        stated = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
+        warnings = better_reading(estimate[both], true[both], mount or RigidTransform.identity(), stated)
         if warnings:
             facts["warnings"] = warnings
     return Bundle(arrays, facts)

@@ -235,6 +235,21 @@ def test_right_claims_give_one_and_halved_deviations_four() -> None:
     assert figures["nees_rotation"]["value"] == pytest.approx(100.0, rel=0.1)
 
 
+def test_errors_that_the_truth_states_are_not_held_against_the_claims() -> None:
+    """An exact estimate against a truth with errors: the first pose's turn moves whatever lies far from it."""
+    rng, true, values = np.random.default_rng(3), straight(20), []
+    shift, turn = 0.02, 0.002
+    for _ in range(300):
+        errors = rng.normal(size=(20, 6)) * np.repeat([shift, turn], 3)
+        measured = true.copy()
+        measured[:, :, :3] = rotation_exp(errors[:, 3:]) @ true[:, :, :3]
+        measured[:, :, 3] += errors[:, :3]
+        figures = trajectory_accuracy(true, measured, np.tile(1e-12 * np.eye(6), (20, 1, 1)), (shift, turn))[1]
+        values.append([figures[name]["value"] for name in ("nees", "nees_position", "nees_rotation")])
+        assert "0.02 m and 0.114592 degrees" in figures["nees"]["how"]
+    np.testing.assert_allclose(np.mean(values, axis=0), 1.0, atol=0.1)
+
+
 def test_covariances_reach_the_figures() -> None:
     true = walk(5, 12)
     _, figures = trajectory_accuracy(true, true, np.tile(1e-6 * np.eye(6), (12, 1, 1)))
