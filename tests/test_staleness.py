@@ -87,6 +87,7 @@ def test_a_parameter_makes_stale_exactly_what_has_it(chain: Chain, parameter: st
 DATASETS = {"mockup": MockupParams, "misalign": MisalignParams}
 SOURCES = [f"{section}.{name}" for section, kind in DATASETS.items() for name in kind.model_fields]
 READ_BY = {
+    "mockup.inclinometer": {"ground_frame"},
     "mockup.up_noise_deg": {"ground_frame"},
     "mockup.attitude_noise_deg": {"ground_frame"},
     **{parameter: {"image/right"} for parameter in SOURCES if parameter.startswith("misalign.")},

@@ -94,12 +94,15 @@ class MockupParams(SetupParams):
         0.0, ge=0.0, le=60.0, description="roll from frame to frame [degrees], right and left in turn"
     )
     jitter_deg: float = Field(0.0, ge=0.0, le=10.0, description="standard deviation of each frame's angles [degrees]")
-    up_noise_deg: float | None = Field(
+    inclinometer: bool = Field(
+        True, description="whether the vertical is measured; false: the ground is levelled by its own plane"
+    )
+    up_noise_deg: float = Field(
         0.2,
         ge=0.0,
         le=10.0,
         description="standard deviation of the inclinometer's error about each axis [degrees], anew in every "
-        "frame; 0: the vertical is exact; not set: no inclinometer, the ground is levelled by its own plane",
+        "frame; 0: the vertical is exact",
     )
     attitude_noise_deg: float | None = Field(
         None,

@@ -152,7 +152,7 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
 
 def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
     """Direction of up in each left camera, as an inclinometer with the stated error gives it."""
-    if p.up_noise_deg is None:
+    if not p.inclinometer:
         return None
     out = []
     for frame, pose in enumerate(truth):

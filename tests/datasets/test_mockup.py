@@ -64,7 +64,7 @@ def test_the_vertical_is_an_inclinometers(bed):
     exact = seq.mockup(MockupParams(frames=2, up_noise_deg=0.0, **bed))
     for up, pose in zip(exact.up, exact.truth, strict=True):
         np.testing.assert_allclose(pose.rotation @ up, [0.0, 0.0, 1.0], atol=1e-12)
-    assert seq.mockup(MockupParams(frames=2, up_noise_deg=None, **bed)).up is None
+    assert seq.mockup(MockupParams(frames=2, inclinometer=False, **bed)).up is None
 
 
 def test_steps_are_30_mm_ahead_and_15_mm_to_the_right():
