@@ -194,8 +194,7 @@ class _Chooser:
 
     def _worth(self, correction: Floats) -> bool:
         """Whether a correction (5,) moves rows or depth by more than the usual error of a good calibration."""
-        rows = float(np.max(np.abs(correction) * self.rows))
-        depth = math.sqrt(float(correction @ self.depth @ correction))
+        rows, depth = (math.sqrt(float(correction @ moved @ correction)) for moved in (self.rows, self.depth))
         # Points beyond infinity prove that depth is wrong, so a correction of any size counts.
         return self.impossible or rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE
 
@@ -242,7 +241,7 @@ class _Chooser:
         """Why a parameter is held; None where it is to be freed."""
         p = self.params
         value, sigma = self._estimate(i, chosen)
-        rows, depth = abs(value) * self.rows[i], abs(value) * math.sqrt(float(self.depth[i, i]))
+        rows, depth = (abs(value) * math.sqrt(float(moved[i, i])) for moved in (self.rows, self.depth))
         found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
         error = self._depth_error(i, chosen)
         if error > MAX_DEPTH_ERROR and not self._infinity(i, chosen):
@@ -282,7 +281,7 @@ class _Chooser:
         asked, certain = self._estimate(i, others)
         why = (
             f"contradicted: {abs(asked) / certain:.0f} times the images' own error, without that of what is held; it "
-            f"moves rows by {abs(value) * self.rows[i]:.2f} px, depth by "
+            f"moves rows by {abs(value) * math.sqrt(float(self.rows[i, i])):.2f} px, depth by "
             f"{abs(value) * math.sqrt(float(self.depth[i, i])):.2%}"
         )
         return Parameter(NAMES[i], value, value, sigma, observed, True, why)
@@ -295,6 +294,6 @@ def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit)
 
 
 def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:
-    """Pixels RMS (5,) that matches move across their lines for a radian of each parameter."""
-    squares = [np.mean(distances(rig, np.zeros(RIG), m.left, m.right)[1][:, :RIG] ** 2, axis=0) for m in pairs]
-    return np.asarray(np.sqrt(np.mean(squares, axis=0)), dtype=np.float64)
+    """Mean square (5, 5), as a quadratic form, of the pixels that matches move across their lines by a correction."""
+    by_radian = [distances(rig, np.zeros(RIG), m.left, m.right)[1][:, :RIG] for m in pairs]
+    return np.asarray(np.mean([d.T @ d / len(d) for d in by_radian], axis=0), dtype=np.float64)

@@ -200,6 +200,20 @@ def test_what_comes_to_nothing_together_is_left(monkeypatch):
     assert "with the others" in decision.parameters[3].why
 
 
+def test_what_moves_rows_singly_and_hardly_together_is_left():
+    """Over flat ground a pitch and the baseline's direction stand in for each other: rows then say nothing of them."""
+    rig, depth = SCENES["bed"]
+    sound = [matches(rig, depth, noise=0.02, pair=k) for k in range(2)]
+    moved, some = parameter_selection.row_sensitivity(rig, sound), [0, 3, 4]
+    against = np.zeros(5)
+    against[some] = np.linalg.eigh(moved[np.ix_(some, some)])[1][:, 0]
+    against *= 0.2 / math.sqrt(against @ moved @ against)
+    assert (np.abs(against) * np.sqrt(np.diag(moved))).max() > 2 * PARAMS.least_rows
+    true = knocked(rig, math.degrees(against[0]), 0.0, 0.0, *np.degrees(against[3:]))
+    decision = decide(rig, [matches(true, depth, noise=0.02, pair=k) for k in range(2)], PARAMS)
+    assert not decision.changed
+
+
 def test_the_principal_point_is_as_certain_in_rays_along_either_axis():
     rig = street_rig()
     flat = replace(rig, right=replace(rig.right, fy=0.5 * rig.right.fy))
