@@ -8,7 +8,8 @@ parameter is freed only if
    remaining uncertainty changes depth little; or matches beyond infinity show that depth is wrong, and the parameter
    explains them;
 2. it is *contradicted*: it differs from the calibration by several of its standard deviations, and a wrong principal
-   point is not the likelier cause. The principal point is the likelier cause if a single angle departs alone;
+   point is not the likelier cause. The principal point is the likelier cause if a single angle departs alone. Where one
+   angle departs, the camera was turned, and of the other angles one standard deviation is enough;
 3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration.
 
 All other parameters stay exactly as given. Angles are tested before the direction of the baseline, because mounts turn
@@ -219,10 +220,14 @@ class _Chooser:
 
     def _knocked(self, i: int, chosen: list[int]) -> bool:
         """Whether it was a turn: other angles changed, too, or the principal point cannot have made the difference."""
-        if self.impossible or any(k != i for k in chosen if k < ANGLES):
+        if self.impossible or self._turned(i, chosen):
             return True
         x, covariance, _ = self._solve([*chosen, i], rival=True)
         return abs(float(x[i])) >= UNLIKELY * math.sqrt(float(covariance[i, i]))
+
+    def _turned(self, i: int, chosen: list[int]) -> bool:
+        """Whether another angle of the rig has changed."""
+        return any(k != i for k in chosen if k < ANGLES)
 
     def _infinity(self, i: int, chosen: list[int]) -> bool:
         """Whether many matches lie beyond infinity, so that depth is surely wrong, and this parameter explains them."""
@@ -251,7 +256,8 @@ class _Chooser:
                 f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {found}, "
                 f"which is {100 * depth:.1f} % of depth"
             )
-        if abs(value) < p.significance * sigma:
+        # Of a rig that was turned nothing says that its other angles are those of the calibration.
+        if abs(value) < (1.0 if i < ANGLES and self._turned(i, chosen) else p.significance) * sigma:
             return f"not contradicted: the images say {found}"
         if not self._knocked(i, chosen):
             return (
