@@ -174,19 +174,19 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         yield at, data, reader.deserialize(data, connection.msgtype)
 
 
-def _stamp(message: Any, at: int) -> int:
-    """Time stamp of a message, ns; that of its recording, ``at``, where its driver has not set one."""
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec) or at
+def _stamp(message: Any) -> int:
+    """Time stamp of a message, ns; 0 where its driver has not set one: then the time of its recording counts."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
     """Images of a topic by their stamp, ns."""
     found: dict[int, TakenImage] = {}
     for at, data, message in _messages(reader, topic):
-        stamp = _stamp(message, at)
+        stamped = _stamp(message)
+        stamp = stamped or at
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
-        stamped = bool(message.header.stamp.sec or message.header.stamp.nanosec)
-        taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id, stamped)
+        taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id, bool(stamped))
         if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
             text = f"{path}: two images of {topic} have the stamp {stamp}"
             raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
@@ -300,7 +300,7 @@ def _movement(
         """
         topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
         # By stamp, for drivers repeat messages.
-        messages = {_stamp(m, at): m for topic in topics[:1] for at, _, m in _messages(reader, topic)}
+        messages = {_stamp(m) or at: m for topic in topics[:1] for at, _, m in _messages(reader, topic)}
         if len(topics) > 1 or (topics and not messages):
             warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
         if len(topics) != 1 or not messages:

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 FORMS = re.compile(
     r"(?i)(EPSG|ESRI|IAU_\d+|IGNF|OGC|urn:ogc:def:crs:EPSG:):|[+{]"
-    r"|(PROJ|PROJECTED|GEOG|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
+    r"|(PROJ|PROJECTED|GEOG|GEOD|GEODETIC|GEOGRAPHIC|GEOC|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
+    r"|(WGS84|WGS72|NAD27|NAD83|CRS84)$"
 )
 """How a CRS begins which GDAL does not look for in a file of that name."""
 

@@ -19,7 +19,8 @@ import numpy as np
 
 from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, rows_of
-from rille.datasets.text.tables import FORCES, RATES, TextTable, read_table
+from rille.datasets.text.tables import TextTable, read_table
+from rille.datasets.text.units import FORCES, RATES
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp

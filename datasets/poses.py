@@ -27,9 +27,10 @@ from typing import Any
 
 import numpy as np
 
-from rille.datasets.text import tables
-from rille.datasets.text.tables import TextTable, read_table, unitless
+from rille.datasets.text import units
+from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
+from rille.datasets.text.units import unitless
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
@@ -119,7 +120,7 @@ def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> T
     rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
     axes = [[columns[axis]] if axis in columns else [] for axis in POSITION]
-    positions = np.hstack([table.measures(axis, tables.LENGTHS, unit) if axis else nothing for axis in axes])
+    positions = np.hstack([table.measures(axis, units.LENGTHS, unit) if axis else nothing for axis in axes])
     poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
     return TimedPoses(times, poses, table.name, warnings)
 
@@ -172,7 +173,7 @@ def read_positions(
     if "time" in meant:  # else rows are pairs
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
         times = times_of(table, meant["time"])
-    rows = table.measures(placed, tables.LENGTHS, unit)
+    rows = table.measures(placed, units.LENGTHS, unit)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 
@@ -259,12 +260,12 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     known = [k for k, a in enumerate(ANGLES) if a in columns]
     values = np.zeros((len(table.rows), 3))
     places = [columns[ANGLES[k]] for k in known]
-    values[:, known] = table.measures(places, tables.ANGLES)
-    units = {table.unit(place) for place in places}
-    if units == {""} and np.abs(values).max() > 2 * np.pi:
-        values, units = np.deg2rad(values), {"deg"}
-    if len(units) != 1 or units == {""}:
-        text = f"{table.name}: roll, pitch and yaw have {'two units' if units - {''} else 'no unit'}"
+    values[:, known] = table.measures(places, units.ANGLES)
+    stated = {table.unit(place) for place in places}
+    if stated == {""} and np.abs(values).max() > 2 * np.pi:
+        values, stated = np.deg2rad(values), {"deg"}
+    if len(stated) != 1 or stated == {""}:
+        text = f"{table.name}: roll, pitch and yaw have {'two units' if stated - {''} else 'no unit'}"
         remedy = "name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.

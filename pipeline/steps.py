@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field, replace
 from operator import index, methodcaller
@@ -65,6 +65,10 @@ class StereoSequence:
 
     def __repr__(self) -> str:
         return f"<StereoSequence {self.name}: {len(self)} pairs>"
+
+    def __reduce__(self) -> tuple[Callable[..., StereoSequence], tuple[str, ...]]:
+        # How its images come about cannot be pickled; another process opens it anew.
+        return _reopened, self.source.opened
 
     @property
     def name(self) -> str:
@@ -169,6 +173,13 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     opened = registry.open_sequence(place_of(path), settings)
     said = (word for one in words for word in ("--set", one))
     return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
+
+
+def _reopened(path: str, *assigned: str) -> StereoSequence:
+    """The sequence of ``Sequence.opened``: its path, and its settings as ``--set section.key=value``."""
+    from rille.pipeline.flow import config
+
+    return open(path, **config.parse_assignments(assigned[1::2]))
 
 
 def place_of(path: object) -> str:

@@ -20,8 +20,9 @@ from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, Pos
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
 from rille.datasets.text.reading import read_lines
-from rille.datasets.text.tables import NUMBER, split, unit_of
+from rille.datasets.text.tables import NUMBER, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
+from rille.datasets.text.units import unit_of
 from rille.stages.core.errors import IncompleteError, InputError
 from rille.stages.geometry.geometry import RigidTransform
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
@@ -40,11 +41,9 @@ def manifest_text(found: Findings, root: str) -> str:
 
 
 def _mount(calibration: FoundCalibration | None) -> str:
-    """Where the left camera stands in the body that the calibration is of, as the value of a key, or an example."""
-    if calibration is None or calibration.mount is None:
-        return "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
-    rows = ", ".join(f"[{', '.join(f'{x:.9g}' for x in row)}]" for row in calibration.mount.matrix34)
-    return f"[{rows}]  # by the calibration, if its body is this one"
+    """Where the left camera stands in the body that the calibration is of, or an example, as the value of a key."""
+    stated = np.eye(3, 4) if calibration is None or calibration.mount is None else calibration.mount.matrix34
+    return "[{}]".format(", ".join(f"[{', '.join(f'{x:.9g}' for x in row)}]" for row in stated))
 
 
 def _value(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ LEDGER = "ledger.jsonl"
 
 def all_runs(runs: Path) -> list[Path]:
     """Folders of all runs that have a ledger, in order of time within each sequence."""
+    if runs.is_dir():
+        os.scandir(runs).close()  # a folder that is closed raises; glob would find nothing in it
     # The link `latest` leads to a run that is there already; a pipe would block for ever.
     return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if p.is_file() and not p.parent.is_symlink())
 

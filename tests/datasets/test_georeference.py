@@ -14,6 +14,10 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.manifest.model import World
 from rille.datasets.text.validation import validated
 
+GEODETIC = (
+    'GEODCRS["WGS 84",DATUM["World Geodetic System 1984",ELLIPSOID["WGS 84",6378137,298.257223563]],CS[ellipsoidal,2],'
+    'AXIS["latitude",north],AXIS["longitude",east],ANGLEUNIT["degree",0.0174532925199433]]'
+)
 ORIGIN = (500100.0, 5200200.0, 1800.0)
 
 
@@ -37,6 +41,8 @@ def test_axes_by_hand() -> None:
         ({"crs": "EPSG:999999"}, ("crs", "no known")),
         ({"crs": "EPSG:32633", "origin": (47.07, 15.44, 350.0), "azimuth_deg": 3.0}, ("47.07", "degrees", "easting")),
         ({"crs": "EPSG:4326"}, ("crs", "projected")),
+        ({"crs": "WGS84"}, ("crs", "projected")),
+        ({"crs": GEODETIC}, ("crs", "projected")),
         ({"crs": "EPSG:2263"}, ("crs", "0.3048")),
         ({"crs": "http://127.0.0.1:1/crs"}, ("crs", "address")),
         ({"crs": "/vsistdin/"}, ("crs", "file")),

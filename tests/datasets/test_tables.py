@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.text.tables import ANGLES, LENGTHS, read_table, unitless
+from rille.datasets.text.tables import read_table
+from rille.datasets.text.units import ANGLES, LENGTHS, unitless
 
 
 def table(tmp_path, text, encoding="utf-8"):

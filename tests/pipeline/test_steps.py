@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,12 @@ def test_its_example_runs() -> None:
     found = doctest.testmod(steps)
     assert found.attempted >= 8
     assert not found.failed
+
+
+def test_a_pair_is_the_same_in_another_process(pair: rille.StereoPair) -> None:
+    there = pickle.loads(pickle.dumps(pair))
+    assert (there.frame, there.sequence.source.opened) == (pair.frame, pair.sequence.source.opened)
+    np.testing.assert_array_equal(there.left, pair.left)
 
 
 def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: Any, dem: Any, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -49,3 +51,13 @@ def test_a_run_has_one_path_however_it_is_named(tmp_path, monkeypatch):
     (tmp_path / "runs/a/latest").symlink_to("20260103")
     monkeypatch.chdir(tmp_path)
     assert {lookup.find(text, Path("runs")) for text in ("latest", "a", "20260103", "a/20260103")} == {run}
+
+
+def test_a_closed_folder_of_runs_is_not_said_to_hold_none(tmp_path, monkeypatch):
+    def closed(place):
+        raise PermissionError(errno.EACCES, "Permission denied", str(place))
+
+    monkeypatch.setattr(os, "scandir", closed)
+    with pytest.raises(PermissionError) as caught:
+        lookup.find("latest", tmp_path)
+    assert caught.value.filename == str(tmp_path)
