@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def metrics(sequence: str, folder: Path, *settings: str, complete: bool = True) -> dict[str, Any]:
-    options = session.Options(settings, runs=folder / "runs", cache=folder / "cache", progress="quiet")
+    options = session.Options(settings, runs=folder / "runs", cache=folder / "cache", quiet=True)
     assert session.perform(sequence, options).code == (0 if complete else 3)
     report = json.loads(next(folder.glob("runs/*/latest/report.json")).read_text())
     assert report["complete"] == complete

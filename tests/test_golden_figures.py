@@ -60,7 +60,7 @@ def figures(name: str, settings: tuple[str, ...], frames: str, folder: Path) -> 
         executor="inline",
         runs=folder / "runs",
         cache=folder / "cache",
-        progress="quiet",
+        quiet=True,
     )
     assert session.perform(name, options).code == 0
     report = json.loads(next(folder.glob("runs/*/latest/report.json")).read_text())

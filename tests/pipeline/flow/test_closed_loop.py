@@ -137,7 +137,7 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_bits(arrived: tuple[Drive, 
 
 @pytest.mark.slow
 def test_the_report_shows_the_drive(arrived: tuple[Drive, Result], store: Path, tmp_path: Path) -> None:
-    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
+    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "quiet": True}
     first = session.perform("mockup-loop", session.Options(SMALL, **given), verb="drive")
     assert first.code == 0
     assert first.lines[0].startswith("goal: ")
@@ -210,7 +210,7 @@ def test_slip_of_thirty_per_cent_stops_says_so_and_keeps_all(
     assert reason.startswith("slip of ")
     assert "by the wheels" in reason
     assert flow.driven.check is not None
-    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "progress": "quiet"}
+    given: dict[str, Any] = {"runs": tmp_path, "cache": store, "executor": "inline", "quiet": True}
     for _ in range(2):  # the second time nothing is computed, and the run before stands
         result = session.perform("mockup-loop", session.Options((*SMALL, *slips), **given), verb="drive")
         assert result.code == session.HOLES

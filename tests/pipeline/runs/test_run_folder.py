@@ -63,3 +63,15 @@ def test_the_command_of_a_run_is_one_line_that_a_shell_takes(tmp_path):
     words = shlex.split(command)
     assert words[:5] == ["rille", "reconstruct", "my data", "--config", str(tmp_path / "my file.toml")]
     assert words[5:9] == ["--set", "drive.goal=[0.1, 2.0]", "--set", "hfvm.preset=fast"]
+
+
+def test_too_few_open_files_are_named_before_anything_is_read(monkeypatch):
+    asked = []
+    monkeypatch.setattr(session.resource, "getrlimit", lambda _: (24, 24))
+    monkeypatch.setattr(session.resource, "setrlimit", lambda _, limits: asked.append(limits))
+    with raises("RIL-584", "24 open files", "ulimit -n"):
+        session.perform("no-such-sequence", session.Options())
+    monkeypatch.setattr(session.resource, "getrlimit", lambda _: (256, 100_000))
+    with raises("RIL-276"):
+        session.perform("no-such-sequence", session.Options())
+    assert asked == [(8192, 100_000)]
