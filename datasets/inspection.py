@@ -197,8 +197,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
         for path in images[: 0 if any(named) else 1]:
             with suppress(InputError):
-                (width, height, _), _ = common_header([path])
-                remedy = f"{SPLIT}; else {remedy}" if width >= 2 * height else remedy
+                found = common_header([path]).header
+                remedy = f"{SPLIT}; else {remedy}" if found.width >= 2 * found.height else remedy
         text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)

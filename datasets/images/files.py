@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -230,8 +230,15 @@ def refuse_swapped(images: Sequence[AnyArray], name: str) -> None:
         raise InputError("RIL-830", text, remedy=f"exchange them: {EXCHANGE} FILES")
 
 
-def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
-    """Width, height and bits a sample of most images; and of each of the others why it cannot be used beside them.
+class Common(NamedTuple):
+    """Header of most images of a camera, and of each of the others why it cannot be used beside them."""
+
+    header: Header
+    refused: dict[Path, str]
+
+
+def common_header(paths: Sequence[Path]) -> Common:
+    """Width, height and bits a sample of most images, and which images have others or cannot be read.
 
     Raises
     ------
@@ -250,7 +257,8 @@ def common_header(paths: Sequence[Path]) -> tuple[Header, dict[Path, str]]:
     if 2 * count <= len(headers):
         raise next(iter((unlike or refused).values()))
     usable(wanted, str(next(path for path in paths if path not in refused)))
-    return wanted, {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
+    words = {p: why.message.replace(str(p), f"{p.parent.name}/{p.name}") for p, why in refused.items()}
+    return Common(wanted, words)
 
 
 def _header(path: Path) -> Header:

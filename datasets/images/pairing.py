@@ -397,7 +397,8 @@ def common_headers(pairs: Sequence[ImagePair]) -> tuple[Headers, tuple[ImagePair
     And the pairs; of those with an image that has others, or cannot be read, ``absent`` says so.
     """
     whole = [pair for pair in pairs if not pair.absent]
-    left, refused = files.common_header([pair.left for pair in whole])
-    right, others = files.common_header([pair.right for pair in whole])
-    causes = [pair.absent or refused.get(pair.left) or others.get(pair.right, "") for pair in pairs]
-    return (left, right), tuple(replace(pair, absent=why) for pair, why in zip(pairs, causes, strict=True))
+    left = files.common_header([pair.left for pair in whole])
+    right = files.common_header([pair.right for pair in whole])
+    causes = [pair.absent or left.refused.get(pair.left) or right.refused.get(pair.right, "") for pair in pairs]
+    checked = tuple(replace(pair, absent=why) for pair, why in zip(pairs, causes, strict=True))
+    return (left.header, right.header), checked

@@ -164,7 +164,7 @@ def test_what_a_camera_writes_behind_a_jpeg_does_not_matter(tmp_path):
     path = tmp_path / "DJI_0001.JPG"
     image = Image.fromarray(known)
     image.save(path, "MPO", save_all=True, append_images=[image.resize((32, 24))], quality=95)
-    assert files.common_header([path])[0] == Header(128, 96, 8)
+    assert files.common_header([path]).header == Header(128, 96, 8)
     assert np.abs(files.read_grey(path).astype(int) - known).mean() < 10
 
 
