@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
@@ -143,9 +143,10 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
     marks |= {"suspects": suspects} if suspects else {}
     warnings += [] if turned else _doubts(share, after, bad_rows)
     # Beside a calibration of other images the differences between pairs say nothing.
-    moves, knocked = ([], "") if far else _drift(linearised(given, pairs), per_pair, params, bad_rows)
-    warnings += moves
-    marks |= {"knocked": knocked} if knocked else {}
+    moves = [] if far else _drift(linearised(given, pairs), per_pair, params)
+    warnings += [move.warning for move in moves]
+    largest = max(moves, key=lambda move: move.rows, default=None)
+    marks |= {"knocked": largest.what} if largest is not None and largest.rows > bad_rows else {}
     return {
         "rig": rig.to_dict(),
         "source": _source(decision, applied, len(pairs)),
@@ -259,12 +260,16 @@ def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
     return lines
 
 
-def _drift(
-    start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams, bad_rows: float
-) -> tuple[list[str], str]:
-    """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
+class _Move(NamedTuple):
+    """A parameter that changes from pair to pair: in words, as a warning, and the most rows it moves, pixels."""
 
-    In words; also one line on what moves the rows most, where that is farther than ``bad_rows``, else nothing.
+    what: str
+    warning: str
+    rows: float
+
+
+def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> list[_Move]:
+    """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
 
     Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
     how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
@@ -277,21 +282,20 @@ def _drift(
     usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
     departure = values - usual
     moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
-    lines, knocked, most = [], "", bad_rows
+    moves = []
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
         odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
         if odd.any():
             # Which of two states is the odd one does not tell when it changed.
             change, degrees = per_pair[int(np.argmax(odd != odd[0]))]["pair"], away[odd].max()
-            if moved[odd].max() > most:
-                most = float(moved[odd].max())
-                knocked = f"the rig moved at pair {change}: {name.replace('_', ' ')} by {degrees:.2f} degrees"
-            lines.append(
+            what = f"the rig moved at pair {change}: {name.replace('_', ' ')} by {degrees:.2f} degrees"
+            warning = (
                 f"the rig moves: {name.replace('_', ' ')} of {int(odd.sum())} of {len(values)} pairs departs from the "
                 f"others', by {degrees:.2f} degrees, first at pair {change}; try rig.mode = per_pair"
             )
-    return lines, knocked
+            moves.append(_Move(what, warning, float(moved[odd].max())))
+    return moves
 
 
 def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:

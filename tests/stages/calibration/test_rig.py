@@ -205,7 +205,7 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
             for k, row in enumerate(degrees)
         ]
         last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
-        return _drift([*start[:-1], last], rows, RigParams(), 1.0)[0]
+        return [move.warning for move in _drift([*start[:-1], last], rows, RigParams())]
 
     alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
     assert told(away, shown=True) == []
