@@ -153,13 +153,14 @@ def _ascending(stems: Sequence[str]) -> list[str]:
 
 def _begun_anew(ordered: Sequence[str]) -> int:
     """Place of the first of some names in order, before which a counter reached its last number (999) and went on from
-    0; 0: none did, as far as one can tell: more numbers are left out than there are."""
+    0, or from 1 as cameras count (DCF); 0: none did, as far as one can tell: more numbers are left out than there
+    are."""
     digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
     if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
         return 0
     numbers = [int(text) for text in digits]
     steps = np.diff(numbers)
-    if numbers[0] or numbers[-1] != 10 ** len(digits[0]) - 1 or steps.max(initial=0) <= len(numbers):
+    if numbers[0] > 1 or numbers[-1] != 10 ** len(digits[0]) - 1 or steps.max(initial=0) <= len(numbers):
         return 0
     return int(np.argmax(steps)) + 1
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.text.count import count
-from rille.datasets.text.reading import GREATEST, read_lines
+from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
 from rille.datasets.text.times import undated
 from rille.datasets.text.units import OPERATOR, UNITS, unit_of
 from rille.datasets.text.warning import warning
@@ -25,6 +25,9 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
+STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
+"""How files begin that hold records of another form: GPX and KML are XML."""
+
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 
@@ -124,9 +127,12 @@ def read_table(path: Path, what: str) -> TextTable:
     Raises
     ------
     InputError
-        It cannot be read, has no rows, or rows differ in length.
+        It cannot be read, is JSON, XML or NMEA, has no rows, or rows differ in length.
     """
     lines = read_lines(path, what)
+    if form := STRUCTURED.match("\n".join(lines[:SAMPLE])):
+        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, all in metres"
+        raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=remedy)
     names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []
     at: list[int] = []

@@ -42,6 +42,8 @@ def test_a_mosaic_of_colours_is_told_from_grey_images(pattern, scale):
         np.random.default_rng(1).integers(0, 255, (200, 200)),
         np.indices((200, 200)).sum(0) // 8 % 2 * 255,  # a board
         np.repeat(np.repeat(np.random.default_rng(2).integers(0, 255, (100, 100)), 2, 0), 2, 1),  # enlarged
+        100 + np.indices((200, 200))[0] % 2 * 20,  # rows of two fields
+        100 + np.indices((200, 200))[1] % 2 * 20,  # columns of two amplifiers
         np.zeros((200, 200), int),
         np.random.default_rng(1).integers(0, 255, (40, 40)),  # too few blocks to tell
     ],

@@ -67,6 +67,10 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
     assert table(tmp_path, "# recorded in the yard\n1 2 3\n").header == ()
 
 
+def test_names_in_brackets_are_no_json(tmp_path):
+    assert table(tmp_path, "[s] [m]\n1 2\n").header == ("[s]", "[m]")
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -75,6 +79,10 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
         ("1,2,3\n4,nan,6\n", ("RIL-284", "t.csv", "line 2", "'nan'")),
         ("1,2,3\n4,-1e300,6\n", ("RIL-284", "t.csv", "line 2", "'-1e300'")),
         ("time,x\n", ("RIL-286", "t.csv")),
+        ('{"frames": [\n 1.0,\n 2.0\n]}\n', ("RIL-979", "JSON")),
+        ("[\n  [1, 2, 3],\n  [4, 5, 6]\n]\n", ("RIL-979", "JSON")),
+        ('\n<?xml version="1.0"?>\n<gpx>\n</gpx>\n', ("RIL-979", "XML")),
+        ("$GPGGA,122640,4900.03,N,824.1,E\n$GPRMC,122640,A\n", ("RIL-979", "NMEA")),
         ("time,x\n2020-09-13,1\n", ("RIL-286", "t.csv", "'2020-09-13,1'")),
     ],
 )
