@@ -79,7 +79,7 @@ class RelativeParams(Params):
         4.0,
         ge=1,
         description="standard deviations, systematic errors included, by which the images must contradict a "
-        "calibrated value to change it",
+        "calibrated value to change it; 1 for the other angles once one has changed",
     )
     least_rows: float = Field(
         0.4,
