@@ -66,7 +66,7 @@ def claims(estimate: Any, covariance: Any, truth: Any) -> dict[str, float]:
     for name, T in (("nees", np.eye(4)), ("nees_mounted", mount)):
         at, true = _four(estimate[known]), _four(truth[known]) @ T
         aligned = at[0] @ np.linalg.inv(true[0]) @ true
-        value = nees(at[:, :3], aligned[:, :3], covariance[known])
+        value = nees(at[:, :3], aligned[:, :3], covariance[known])["nees"]
         found[name] = float("nan") if isinstance(value, str) else value
     return found
 

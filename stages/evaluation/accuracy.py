@@ -16,7 +16,7 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -78,8 +78,8 @@ def trajectory_accuracy(
         if any(sigma):
             how += f"; with {sigma[0]:g} m and {math.degrees(sigma[1]):g} degrees of the truth itself"
         total = covariance + _of_truth(aligned, aligned[start], sigma)
-        for name, part, whose in CLAIMS:
-            figures[name] = metric(nees(estimate, aligned, total, part), "", how + whose)
+        values = nees(estimate, aligned, total)
+        figures |= {name: metric(values[name], "", how + whose) for name, _, whose in CLAIMS}
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
 
 
@@ -154,25 +154,26 @@ def _of_truth(aligned: Floats, first: Floats, sigma: Sequence[float]) -> Floats:
     return own + moved @ own @ np.swapaxes(moved, 1, 2)
 
 
-def nees(P: Floats, aligned: Floats, covariance: Floats, part: slice = slice(0, 6)) -> float | str:
-    """Mean squared error over the claimed one, per degree of freedom; or why it does not apply.
+def nees(P: Floats, aligned: Floats, covariance: Floats) -> Mapping[str, float | str]:
+    """Mean squared errors over the claimed ones, per degree of freedom, by the names of :data:`CLAIMS`; or why they do
+    not apply.
 
     ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
-    exact: ``aligned`` is the truth with the first poses made equal. ``part``: which of the six are judged.
+    exact: ``aligned`` is the truth with the first poses made equal.
     """
+    names = [name for name, *_ in CLAIMS]
     claimed = posed(P) & posed(covariance)
     known = claimed & posed(aligned)
     # The first frame is exact by definition and has no covariance to judge.
     rows = np.flatnonzero(known)[1:]
     if len(rows) == 0 or not known[np.argmax(claimed)]:
-        return "no truth of the first posed frame, where the covariances begin, and of later ones"
+        return dict.fromkeys(names, "no truth of the first posed frame, where the covariances begin, and of later ones")
     if not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
-        return "a covariance is singular"
+        return dict.fromkeys(names, "a covariance is singular")
     turn = rotation_log(aligned[rows, :, :3] @ np.swapaxes(P[rows, :, :3], 1, 2))
-    error = np.concatenate([aligned[rows, :, 3] - P[rows, :, 3], turn], axis=1)
-    error = error[:, part]
-    weighed = np.linalg.solve(covariance[rows, part, part], error[..., None])[..., 0]
-    return float(np.mean(error * weighed))
+    error, claim = np.concatenate([aligned[rows, :, 3] - P[rows, :, 3], turn], axis=1)[..., None], covariance[rows]
+    parts = {name: (error[:, part], claim[:, part, part]) for name, part, _ in CLAIMS}
+    return {name: float(np.mean(e * np.linalg.solve(c, e))) for name, (e, c) in parts.items()}
 
 
 def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:

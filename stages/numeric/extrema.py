@@ -33,50 +33,26 @@ def octagon(reach: int) -> tuple[int, int]:
 
 def running_max(surface: Floats32, reach: int) -> Floats32:
     """Return the highest known value (row, col) in the octagon of ``reach`` cells; -inf where all are NaN."""
-    return _inside(_widened(_padded(surface, reach), *octagon(reach)), reach)
+    side, diagonal = octagon(reach)
+    line = np.eye(2 * diagonal + 1, dtype=np.uint8)
+    z, border = np.where(np.isnan(surface), UNKNOWN_HEIGHT, surface), float(UNKNOWN_HEIGHT)
+    z = cv2.copyMakeBorder(z, *(reach,) * 4, cv2.BORDER_CONSTANT, value=border)
+    for window in (np.ones((2 * side + 1, 2 * side + 1), dtype=np.uint8), line, line[:, ::-1].copy()):
+        if window.size > 1:
+            # OpenCV's own border would repeat the edge; the padding must stay unknown.
+            z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=border)
+    return np.ascontiguousarray(z[reach:-reach, reach:-reach])
 
 
 def relief(surface: Floats32, near: int, reach: int) -> tuple[Floats32, Floats32]:
     """Highest minus lowest value (row, col) within two octagons, ``near`` and ``reach`` >= near.
 
-    It is 0 where all is unknown. The larger octagon is the smaller one widened once more, so it starts from that one's
-    extrema.
+    It is 0 where all is unknown.
     """
-    side, diagonal = octagon(near)
-    more, steps = (b - a for a, b in zip((side, diagonal), octagon(reach), strict=True))
-    if more < 0 or steps < 0:  # one octagon is not a widening of the other
-        small, large = ([running_max(z, n) for z in (surface, -surface)] for n in (near, reach))
-        return _above_zero(*small), _above_zero(*large)
-    small = [_widened(_padded(z, reach), side, diagonal) for z in (surface, -surface)]
-    large = [_widened(z, more, steps) for z in small]
-    return _above_zero(*(_inside(z, reach) for z in small)), _above_zero(*(_inside(z, reach) for z in large))
-
-
-def _above_zero(high: Floats32, depth: Floats32) -> Floats32:
-    """Highest minus lowest, which is the highest plus the greatest depth."""
-    relief: Floats32 = np.maximum(high + depth, np.float32(0.0))
-    return relief
-
-
-def _padded(surface: Floats32, by: int) -> Floats32:
-    """The surface with a border; the border and the unknown are :data:`UNKNOWN_HEIGHT`."""
-    z = np.where(np.isnan(surface), UNKNOWN_HEIGHT, surface)
-    padded: Floats32 = cv2.copyMakeBorder(z, by, by, by, by, cv2.BORDER_CONSTANT, value=float(UNKNOWN_HEIGHT))
-    return padded
-
-
-def _inside(padded: Floats32, by: int) -> Floats32:
-    return np.ascontiguousarray(padded[by:-by, by:-by])
-
-
-def _widened(z: Floats32, side: int, diagonal: int) -> Floats32:
-    """Running maximum over a square of half side ``side``, then over both diagonals of ``diagonal`` steps."""
-    line = np.eye(2 * diagonal + 1, dtype=np.uint8)
-    for window in (np.ones((2 * side + 1, 2 * side + 1), dtype=np.uint8), line, line[:, ::-1].copy()):
-        if window.size > 1:
-            # OpenCV's own border would repeat the edge; the padding must stay unknown.
-            z = cv2.dilate(z, window, borderType=cv2.BORDER_CONSTANT, borderValue=float(UNKNOWN_HEIGHT))
-    return z
+    high, depth = ([running_max(z, n) for n in (near, reach)] for z in (surface, -surface))
+    # Highest minus lowest, which is the highest plus the greatest depth.
+    small, large = (np.maximum(a + b, np.float32(0.0)) for a, b in zip(high, depth, strict=True))
+    return small, large
 
 
 def median3(surface: Floats32) -> Floats32:

@@ -15,12 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.planning import LegFacts, RiskFacts
 from rille.stages.facts.terrain import BoundsFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform, from_above, way_length
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.rigid import posed
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
@@ -114,6 +116,11 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
     return Hazards(maps[0], maps[1], maps[2], unknown, glanced, maps[2] >= MIN_DOUBTED_PROBABILITY)
 
 
+def _stands(poses: Floats, T_vehicle_left: RigidTransform) -> list[Stand]:
+    """Places of the vehicle at the poses (n, 3, 4) T_world_left of its left camera."""
+    return [from_above(RigidTransform.from_matrix(pose) @ T_vehicle_left.inverse()) for pose in poses]
+
+
 class LegInputs(NamedTuple):
     """Hazards of near ground, of all that was seen, and bounds of the ground that was not; pose and rig of the cameras;
     the leg before; poses of the left camera on the way so far."""
@@ -158,11 +165,9 @@ def local_planner_stage(
     whole: bool = False,
 ) -> Bundle[LegFacts]:
     """The next leg of a drive to a goal, over ground that is known to be free."""
+    (stand,) = _stands(np.asarray(inputs.pose["poses"])[-1:], T_vehicle_left)
     driven = np.zeros((0, 3, 4)) if inputs.driven is None else np.asarray(inputs.driven["poses"])
-    stand, *track = (
-        from_above(RigidTransform.from_matrix(T_world_left) @ T_vehicle_left.inverse())
-        for T_world_left in (np.asarray(inputs.pose["poses"])[-1], *driven[np.isfinite(driven).all((1, 2))])
-    )
+    track = _stands(driven[posed(driven)], T_vehicle_left)
     end = (float(goal[0]), float(goal[1]))
     memory = PlannerMemory(looks, [(float(x), float(y)) for x, y in closed], track=track)
     rest, before, ceiling = None, inputs.before, inputs.ceiling

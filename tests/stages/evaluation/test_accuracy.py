@@ -225,9 +225,9 @@ def test_right_claims_give_one_and_halved_deviations_four() -> None:
     true[1:, :, :3] = [rotation_exp(e) @ true[0, :, :3] for e in errors[1:, 3:]]
     covariance = np.tile(claimed, (n, 1, 1))
     covariance[0] = 0.0
-    value = nees(estimate, true, covariance)
+    value = nees(estimate, true, covariance)["nees"]
     assert value == pytest.approx(1.0, abs=5 * (2 / 6 / n) ** 0.5)
-    assert nees(estimate, true, covariance / 4) == pytest.approx(4 * value)
+    assert nees(estimate, true, covariance / 4)["nees"] == pytest.approx(4 * value)
     # Rotations claimed ten times too exactly: that is said of them alone.
     small = np.diag([1.0] * 3 + [0.1] * 3)
     figures = trajectory_accuracy(estimate, true, small @ covariance @ small)[1]
@@ -262,6 +262,6 @@ def test_why_claims_are_not_judged_is_said() -> None:
     late, singular = poses.copy(), claimed.copy()
     late[0] = np.nan
     singular[3, 5, 5] = 0.0
-    assert "the first posed frame" in nees(poses, late, claimed)
-    assert "the first posed frame" in nees(poses[:1], poses[:1], claimed[:1])
-    assert "singular" in nees(poses, poses, singular)
+    assert "the first posed frame" in nees(poses, late, claimed)["nees"]
+    assert "the first posed frame" in nees(poses[:1], poses[:1], claimed[:1])["nees"]
+    assert "singular" in nees(poses, poses, singular)["nees"]
