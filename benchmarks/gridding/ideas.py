@@ -29,7 +29,7 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("smoothness in it", {}, {(refinement, "BEND_STIFFNESS"): 40.0}),
     ("weights against highlights", {}, {(refinement, "HALVING_RESIDUAL_GREY"): 1e9}),
     ("a window for the local mean", {}, {(refinement, "MEAN_SIDE_CELLS"): 151}),
-    ("limit of a jump", {"max_jump": 1e9}, {}),
+    ("limit of a jump", {}, {(solve, "MAX_JUMP_PX"): 1e9}),
     ("limit of the residual", {"max_residual": 1e9}, {}),
     ("limit of the standard deviation", {"max_std": 1e9}, {}),
     ("doubt beside hidden ground", {}, {(uncertainty, "HOLE_VARIANCE_PX2"): 0.0}),

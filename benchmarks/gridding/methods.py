@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.solve import MAX_JUMP_PX, LocusParams, Matches
 from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
 
 from .mesh import rasterise, without_jumps
@@ -91,7 +91,7 @@ def triangulate(scene: Scene, max_backmatch: float, bounded: bool) -> Cloud:
     points[usable], sigmas[usable] = found, own
     kept = usable.copy()
     kept[usable] = good
-    quads = without_jumps(d.column, d.row, kept, DEFAULT.max_jump)
+    quads = without_jumps(d.column, d.row, kept, MAX_JUMP_PX)
     return Cloud(points, kept & _corner_of(quads), sigmas, quads)
 
 

@@ -42,15 +42,10 @@ class Follows(NamedTuple):
     sets: dict[str, Any]
 
 
-ACCURATE_FOLLOWS = (
-    Follows("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),
-    Follows("locus", "both", True, {"locus": {"max_jump": 5.0}}),
-)
+ACCURATE_FOLLOWS = (Follows("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),)
 """What follows of that preset where the user has overruled none of these values.
 
-With an accurate matcher the mean of what the disparity says and of what the images show is better than either. With
-both directions a cell's own standard deviation tells good from bad, so it is left more to choose from: disparities may
-jump by 5 pixels (beyond that nothing is gained).
+With an accurate matcher the mean of what the disparity says and of what the images show is better than either.
 """
 
 

@@ -19,6 +19,7 @@ from rille.stages.geometry.scale import axes
 from rille.stages.terrain.locus.kernel import Cells, Dem, Observed, PairCameras, search
 
 COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
+MAX_JUMP_PX = 3.0  # range of the four disparities around a cell that are one surface; beyond, ground is hidden there
 ONE_SIDED_STD_FACTOR = 2.0  # matched one way alone: errors of such cells are two to three times as large
 
 
@@ -65,9 +66,6 @@ class LocusParams(Params):
     both: bool = Field(
         False, description="also match from right to left and use both elevations; doubles the time of matching"
     )
-    max_jump: float = Field(
-        3.0, gt=0, description="largest range of the four disparities around a cell [pixels] that are one surface"
-    )
 
 
 def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) -> Observed:
@@ -79,7 +77,7 @@ def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) 
     disparity[~matches.usable] = np.nan
     std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
     grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
-    return Observed(disparity, std, grey, params.max_residual, params.max_jump, axes(rig))
+    return Observed(disparity, std, grey, params.max_residual, MAX_JUMP_PX, axes(rig))
 
 
 def cameras_of(rig: Rig, T_local_left: RigidTransform) -> PairCameras:

@@ -26,14 +26,14 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
     assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
-    assert (built.locus.cell_size, built.locus.max_jump) == (0.01, 5.0)
+    assert built.locus.cell_size == 0.01
     assert (plain.track.points, built.track.points) == (400, 2000)
     assert built.hfvm == config.build({"hfvm": {"preset": "accurate"}}).hfvm
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
-    assert built.locus.max_jump == plain.locus.max_jump, "as without both"
+    assert built.locus.refined_share == 0.5, "that of the matcher"
     built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
-    assert (built.locus.refined_share, built.locus.max_jump) == (1.0, 5.0), "one of each"
+    assert (built.locus.refined_share, built.locus.both) == (1.0, True), "one of each"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
     with raises("RIL-027", "terrain.preset", "'best'"):
         config.build({"terrain": {"preset": "best"}})

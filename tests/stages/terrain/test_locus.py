@@ -128,15 +128,8 @@ def test_a_right_camera_of_another_scale_sees_no_jumps_of_its_own(scale: float) 
     seen = found[0] & found[1]
     column, row, usable = disparity(rig, T_LOCAL_LEFT, plane(0.0, 0.0, -HEIGHT))
     rows, cols = np.indices(column.shape)
-    odd = np.where((rows + cols) % 2, scale * 2.0, 0.0)
-    even = reconstruct(
-        pair(column + odd, row, usable),
-        rig,
-        T_LOCAL_LEFT,
-        LATTICE,
-        (-1.0, -0.3),
-        LocusParams(max_jump=1.0),
-    )
+    odd = np.where((rows + cols) % 2, scale * 4.0, 0.0)
+    even = solve((column + odd, row, usable), (-1.0, -0.3), rig)
     assert not np.isfinite(even.elevation[seen]).any()
 
 
