@@ -46,11 +46,11 @@ from rille.stages.geometry.epipolar import (
     corrected,
     distances,
     image_turn,
-    refuse_impossible,
     standing,
 )
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import right_pixels
+from rille.stages.geometry.sides import refuse_impossible
 from rille.stages.numeric.robust import mad_sigma
 
 MAX_MATCHES = 10_000

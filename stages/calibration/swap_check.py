@@ -1,16 +1,11 @@
-"""Whether left and right of one pair are exchanged: matches of their features under the rig as given, and exchanged.
-
-With parallel cameras exchanged images lie beyond infinity; with cameras turned inward they need not, but their rows
-then depart the wrong way towards the corners. A match therefore fits the rig if it lies near its epipolar line *and*
-in front of the cameras.
-"""
+"""Whether left and right of one pair are exchanged: matches of their features under the rig as given, and exchanged."""
 
 from __future__ import annotations
 
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SwapFacts
-from rille.stages.geometry.epipolar import exchanged
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.sides import exchanged
 from rille.stages.imaging.features import matched_points
 
 LEAST = 50

@@ -20,10 +20,8 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
 from rille.stages.geometry.projection import product
-from rille.stages.geometry.scale import right_pixels
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in the order of every vector of them."""
@@ -162,43 +160,6 @@ def image_turn(rig: Rig, left: Floats, right: Floats) -> float:
     here, there = (points @ (1.0, 1.0j) for points in seen)
     (cosine, _, _), (sine, _, _), _ = rig.T_right_left.rotation
     return float(np.degrees(np.angle((here.conj() * there).sum() * complex(cosine, -sine))))
-
-
-def fits(rig: Rig, left: Floats, right: Floats, tolerance: float = MAX_LINE_DISTANCE_PX) -> float:
-    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance``, pixels of the coarser image, of their epipolar
-    lines, ahead."""
-    tolerance *= right_pixels(rig)
-    off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
-    return float(np.mean((np.abs(off) < tolerance) & ahead))
-
-
-def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float]:
-    """Whether left and right are exchanged; shares of the matches that fit the rig as given, and the other way."""
-    as_given, other_way = fits(rig, left, right), fits(rig, right, left)
-    # Most of the matches fit the other way, and twice as many as the given one.
-    return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
-
-
-def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
-    """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig with its sides exchanged.
-
-    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines.
-    """
-    swapped, as_given, other_way = exchanged(rig, left, right)
-    if swapped:
-        raise DegenerateError(
-            "RIL-781",
-            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, and the sign of the baseline",
-        )
-    if beyond > 0.5:
-        raise DegenerateError(
-            "RIL-375",
-            f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="check that left and right are of one scene and one time, and the angles between the cameras",
-        )
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:

@@ -30,10 +30,11 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.epipolar import inverse_depth, refuse_impossible
+from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig, RigidTransform, level_rotation
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.scale import coarser_focal
+from rille.stages.geometry.sides import refuse_impossible
 from rille.stages.terrain.ground import (
     MIN_POINTS,
     CoarseGroundError,

@@ -6,8 +6,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from rille.stages.calibration import swap_check
 from rille.stages.core.declare import NoParams
-from rille.stages.geometry.epipolar import fits
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.sides import fits
 from rille.stages.imaging.features import extract
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
