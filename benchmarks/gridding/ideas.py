@@ -27,7 +27,6 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("second step of it", {"refine_steps": 1}, {}),
     ("edges in it", {}, {(refinement, "MAX_BEND_PX"): 1e9}),
     ("smoothness in it", {}, {(refinement, "BEND_STIFFNESS"): 40.0}),
-    ("weights against highlights", {}, {(refinement, "HALVING_RESIDUAL_GREY"): 1e9}),
     ("a window for the local mean", {}, {(refinement, "MEAN_SIDE_CELLS"): 151}),
     ("limit of a jump", {}, {(solve, "MAX_JUMP_PX"): 1e9}),
     ("limit of the residual", {"max_residual": 1e9}, {}),

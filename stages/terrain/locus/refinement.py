@@ -2,11 +2,11 @@
 
 Locus reads each cell from the disparity around one pixel. Here the elevations Z of all solved cells minimise together
 
-    sum a w (L(p_l) - R(p_r) - m)^2  +  stiffness sum s |second difference of Z|^2
+    sum a (L(p_l) - R(p_r) - m)^2  +  stiffness sum s |second difference of Z|^2
 
 with p_l and p_r the cell's projections, m the local mean of the difference, a the share of a pixel that the cell is
-(a cell smaller than a pixel brings no more than that), w falling with the difference and s with the second difference
-found, so that neither a wrong cell nor an edge drags its neighbours along. It is object-space matching (Helava 1988;
+(a cell smaller than a pixel brings no more than that) and s falling with the second difference found, so that no edge
+drags its neighbours along. It is object-space matching (Helava 1988;
 Wrobel 1987, facets stereo vision): no image is the master, the geometry is the calibrated one, and smoothness is that
 of the terrain and not of its perspective picture. A fixed number of Gauss-Newton steps, each solved by a fixed number
 of sweeps (:mod:`rille.stages.numeric.relaxation`).
@@ -34,8 +34,6 @@ MAX_CHANGE_PX = 1.0
 
 MEAN_SIDE_CELLS = 15
 """Side [cells] of the window of the local mean; brightness varies more slowly."""
-HALVING_RESIDUAL_GREY = 10.0
-"""Difference [grey levels] that halves a cell's weight, well above camera noise."""
 
 
 def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
@@ -89,8 +87,5 @@ def _misfit(seen: OrthoPair, keep: Bools) -> tuple[Floats32, Floats32]:
     none = np.float32(0.0)
     rest = np.where(keep, seen.left - seen.right, none)
     mean = window_sum32(rest, MEAN_SIDE_CELLS) / np.maximum(window_sum32(keep, MEAN_SIDE_CELLS), np.float32(1.0))
-    misfit = np.where(keep, rest - mean, none)
-    # Cauchy's weight: a highlight or a shadow in one image counts less, but is not forgotten at once. A cell smaller
-    # than a pixel brings no more than its share of the pixel.
-    weight = np.fmin(seen.area, 1.0) / (np.float32(1.0) + np.square(misfit / np.float32(HALVING_RESIDUAL_GREY)))
-    return np.where(keep, weight, none), misfit
+    # A cell smaller than a pixel brings no more than its share of the pixel.
+    return np.where(keep, np.fmin(seen.area, 1.0), none), np.where(keep, rest - mean, none)
