@@ -1,5 +1,7 @@
 """Resection: Eq. 4, 5, 7, 8; Jacobian; exact, noisy and contaminated data; covariance; degenerate cases by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pointing_angles import angles_from_rotation, rotation_from_angles
@@ -121,6 +123,16 @@ def test_exact_data_give_the_exact_pose():
         np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
         assert found.inlier.all()
         assert found.residual.max() < 1e-6
+
+
+@pytest.mark.parametrize("column", [-900.0, 1600.0])
+def test_images_cut_beside_the_axis_are_posed(column):
+    rng = np.random.default_rng(2)
+    T, landmarks, moved = true_pose(rng), scene(rng), [column - CAMERA.cx, 0.0]
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)))
+    given = seen(T, landmarks) + moved, replace(CAMERA, cx=column), [RigidTransform.identity()]
+    found = resect(known, *given, PARAMS, 7)
+    np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
 
 
 def test_large_motion_needs_no_good_start():
