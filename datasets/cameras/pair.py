@@ -72,7 +72,8 @@ def rig_of(
             "RIL-130",
             f"swapped cameras: the right camera {right.name} stands {-to_the_right:.4g} m to the left of the left "
             f"camera {left.name}",
-            remedy="exchange left and right, of the images too if they are swapped as well or show all upside down",
+            remedy="invert the transformation if it leads from right to left; else exchange left and right, "
+            "of the images too if they are swapped as well or show all upside down",
         )
     distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
     return rig, distorted or None

@@ -14,6 +14,7 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
+from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
@@ -34,7 +35,7 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
     """
     if not sequence.masks:
         return sequence
-    notes, masks = [], sequence.masks
+    notes, lines, masks = [], [], sequence.masks
     for side, path in masks.items():
         lens = (sequence.lenses or {}).get(side)
         camera = getattr(sequence.rig, side) if lens is None else lens.camera
@@ -47,7 +48,11 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
         if keep.mean() < 0.05:
             text = f"{place} leaves {100 * keep.mean():.1f} % of the image"
             raise InputError("RIL-905", text, remedy="make bright what is to be used, and dark what is not")
-        notes.append(f"a mask leaves out {100 * (1 - keep.mean()):.1f} % of the {side} images ({path.name})")
+        text = f"a mask leaves out {100 * (1 - keep.mean()):.1f} % of the {side} images ({path.name})"
+        if keep.mean() < 0.5:
+            lines.append(warning("RIL-909", f"{text}: is it the wrong way round? Bright pixels are used"))
+        else:
+            notes.append(text)
 
     def image(frame: int, camera: str) -> Source:
         source = sequence.image(frame, camera)
@@ -57,7 +62,8 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
         hints = {"path": str(masks[camera].resolve())}
         return Source("rille.datasets.images.masks", NoParams(), args, hints, {"image": source})
 
-    return replace(sequence, image=image, notes=(*sequence.notes, *notes))
+    warnings = (*sequence.warnings, *lines)
+    return replace(sequence, image=image, notes=(*sequence.notes, *notes), warnings=warnings)
 
 
 @stage("masked_image", outputs=files.image_stage.outputs)

@@ -237,7 +237,9 @@ def unusual(camera: Camera, side: str) -> list[str]:
     # Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration
     if off > 0.1:
         place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {camera.width} x {camera.height} images"
-        lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were images scaled or cut?"))
+        of = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
+        scaled = f"scaled to {1 / max(of):.2g} of their size" if 0.0 < max(of) < 1.1 * min(of) else "scaled or cut"
+        lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were images {scaled}?"))
     if not 0.8 < camera.fx / camera.fy < 1.25:
         text = f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels"
         lines.append(warning("RIL-691", text))

@@ -265,7 +265,8 @@ class Search:
             for folder in level:
                 entries = [e for e in self.entries(folder) if hidden or not HIDDEN.match(e.name)]
                 yield folder, entries
-                inner += [Path(e.path) for e in entries if e.is_dir(follow_symlinks=links)]
+                # os.path: a link that leads to itself, or into a closed folder, is no folder.
+                inner += [Path(e.path) for e in entries if os.path.isdir(e) and (links or not e.is_symlink())]
             places = {os.path.realpath(path): path for path in reversed(inner)}
             level = [places[place] for place in reversed(places) if place not in entered]
             entered |= places.keys()

@@ -99,7 +99,12 @@ LIMITS = {
         InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
     ),
     "sides": (
-        Fault("RIL-659", "beyond", most=0.5, remedy="left and right are swapped, or the baseline has the wrong sign"),
+        Fault(
+            "RIL-659",
+            "beyond",
+            most=0.5,
+            remedy="left and right are swapped, the baseline has the wrong sign, or the scene repeats (bricks, tiles)",
+        ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
     "epipolar": (

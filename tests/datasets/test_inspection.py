@@ -476,6 +476,7 @@ def test_folders_that_are_links_are_looked_into_once(tmp_path):
         (tmp_path / "here" / "deep").mkdir(parents=True, exist_ok=True)
         (tmp_path / "here" / side).symlink_to(tmp_path / "far" / side)
         (tmp_path / "here" / "deep" / side).symlink_to(tmp_path / "here")
+    (tmp_path / "here" / "itself").symlink_to("itself")
     found = inspect(tmp_path / "here").views
     assert (found.left, found.right, found.pairs) == ("left/*.png", "right/*.png", 2)
 

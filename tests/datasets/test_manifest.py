@@ -645,8 +645,9 @@ def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
         ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
-            r"principal point \(315, 23\.5\) px is far from",
+            r"principal point \(315, 23\.5\) px is far from .* scaled or cut",
         ),
+        ({"cameras": "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"}, r"were images scaled to 0\.5 of their size"),
         ({"cameras": CAMERAS + "fy = 120.0\n"}, r"fx = 60 and fy = 120 px differ much"),
     ],
 )

@@ -41,6 +41,12 @@ def test_a_mask_leaves_out_what_is_dark(tmp_path, materialise, sides):
     assert sum("37.5 % of the" in note for note in s.notes) == len(sides)
 
 
+def test_a_mask_that_leaves_less_than_half_may_be_the_wrong_way_round(tmp_path):
+    (line,) = sequence(tmp_path, 255 - body(), ("left",)).warnings
+    assert line.startswith("RIL-909")
+    assert "62.5 % of the left" in line
+
+
 @pytest.mark.parametrize("scale", [1, 255, 65535])
 def test_any_scale_means_the_same(scale):
     drawn = body(1).astype(np.uint16) * scale

@@ -226,8 +226,7 @@ class PosedTracks(NamedTuple):
 
     def landmarks(self) -> Floats:
         """Landmarks (n, 3) in this state, m, local frame."""
-        known = self.tracks.landmarks
-        return known.position + (self.state.depth + self.state.bias)[:, None] * known.per_pixel
+        return self.tracks.landmarks.moved(self.state.depth + self.state.bias)
 
 
 class PoseErrors(NamedTuple):

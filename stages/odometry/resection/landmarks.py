@@ -41,12 +41,15 @@ class Landmarks:
     position : (n, 3) in the local frame, m; NaN if a landmark has no coordinates.
     per_pixel : (n, 3) motion along the ray, away from the camera, for a change of the disparity by a pixel, m/pixel.
     sigma : (n,) standard deviation of the disparity, pixels.
+    share : (n,) change of the inverse depth for a pixel over the inverse depth, 1/pixel: 1 over the disparity of a
+        parallel rig; 0 moves landmarks in proportion to pixels.
     lost : number of landmarks without coordinates, by reason.
     """
 
     position: Floats
     per_pixel: Floats
     sigma: Floats
+    share: Floats | float = 0.0
     lost: dict[str, int] = field(default_factory=dict)
 
     def summary(self) -> str:
@@ -55,7 +58,22 @@ class Landmarks:
 
     def take(self, which: NDArray[np.intp]) -> Landmarks:
         """Some of them."""
-        return Landmarks(self.position[which], self.per_pixel[which], self.sigma[which], self.lost)
+        share = np.broadcast_to(self.share, self.sigma.shape)[which]
+        return Landmarks(self.position[which], self.per_pixel[which], self.sigma[which], share, self.lost)
+
+    def moved(self, pixels: Floats) -> Floats:
+        """Coordinates (n, 3) for disparities that are larger by ``pixels`` (n,)."""
+        return self.position + (pixels * nearness(self.share, pixels))[:, None] * self.per_pixel
+
+
+def nearness(share: Floats | float, pixels: Floats | float) -> Floats:
+    """Inverse depths before over those after a change of the disparities by ``pixels``.
+
+    Disparities are linear in inverse depths, not in depths: a depth that is linear in the disparity makes errors of
+    disparities smaller where the whole scene is nearer, so an adjustment would pull scenes of one depth towards the
+    camera, and shorten the path. Farther than ten times as far nothing is moved: infinity lies there.
+    """
+    return np.asarray(1.0 / np.maximum(1.0 - np.asarray(share) * pixels, 0.1))
 
 
 class SegmentPoints(NamedTuple):
@@ -104,7 +122,7 @@ def landmarks_of(
         "too far for the baseline": int((smooth & ~near).sum()),
     }
     position, per_pixel = (np.where(near[:, None], a, np.nan) for a in (landmarks.position, landmarks.per_pixel))
-    return Landmarks(position, per_pixel, np.where(near, sigma, np.nan), lost)
+    return Landmarks(position, per_pixel, np.where(near, sigma, np.nan), landmarks.share, lost)
 
 
 def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTransform, sigma: Floats) -> Landmarks:
@@ -113,7 +131,7 @@ def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTra
     inverse, slope = inverse_depth(rig, points, right - points)
     depth = 1.0 / np.where(inverse > 0, inverse, np.nan)
     along = (depth**2 * slope)[:, None] * (rays @ T_local_left.rotation.T)
-    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma)
+    return Landmarks(T_local_left.apply(rays * depth[:, None]), along, sigma, depth * slope)
 
 
 def matches_at(points: Floats, disparity: Bundle, unit: float = 1.0) -> tuple[Floats, Bools, Floats]:

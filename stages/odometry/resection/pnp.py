@@ -25,7 +25,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, Pinhole, linearise, perturbed, rotated
 from rille.stages.numeric.robust import huber_weight
-from rille.stages.odometry.resection.landmarks import Landmarks
+from rille.stages.odometry.resection.landmarks import Landmarks, nearness
 
 HUBER = 2.5
 """Huber's bound in standard deviations: 4 % of Gaussian errors in two dimensions lie beyond it."""
@@ -35,13 +35,14 @@ class Observations(NamedTuple):
     """Landmarks as one frame observes them.
 
     ``landmarks`` (n, 3) in the local frame, m; ``per_pixel`` (n, 3) motion of a landmark for a change of its disparity
-    by a pixel, m/pixel; ``sigma`` (n,) standard deviation of the disparity, pixels; ``pixels`` (n, 2) observed column
-    and row; ``pixel_sigma`` standard deviation of these, pixels.
+    by a pixel, m/pixel; ``sigma`` (n,) standard deviation of the disparity, pixels; ``share`` (n,) as that of
+    :class:`Landmarks`; ``pixels`` (n, 2) observed column and row; ``pixel_sigma`` standard deviation of these, pixels.
     """
 
     landmarks: Floats
     per_pixel: Floats
     sigma: Floats
+    share: Floats
     pixels: Floats
     camera: Pinhole
     pixel_sigma: float
@@ -49,11 +50,12 @@ class Observations(NamedTuple):
     @staticmethod
     def of(landmarks: Landmarks, pixels: Floats, camera: Camera, pixel_sigma: float) -> Observations:
         """Landmarks as a camera observes them at ``pixels`` (n, 2)."""
-        position, per_pixel, sigma, seen = (
+        share = np.broadcast_to(landmarks.share, landmarks.sigma.shape)
+        position, per_pixel, sigma, share, seen = (
             np.ascontiguousarray(a, dtype=np.float64)
-            for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, pixels)
+            for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, share, pixels)
         )
-        return Observations(position, per_pixel, sigma, seen, Pinhole.of(camera), pixel_sigma)
+        return Observations(position, per_pixel, sigma, share, seen, Pinhole.of(camera), pixel_sigma)
 
 
 class Pose(NamedTuple):
@@ -88,8 +90,10 @@ class Errors(NamedTuple):
 def back_projection(obs: Observations, pose: Pose) -> Errors:
     """Eq. 7 and 8 at a pose, linearised."""
     whitened, lengths = np.zeros((len(obs.pixels), 2, 8)), np.empty((len(obs.pixels), 3))
-    moved = obs.landmarks + np.reshape(pose.bias, (-1, 1)) * obs.per_pixel
-    _linearised(obs._replace(landmarks=moved), pose.R, pose.t, whitened, lengths)
+    near = nearness(obs.share, pose.bias)
+    landmarks = obs.landmarks + (pose.bias * near)[:, None] * obs.per_pixel
+    moved = obs._replace(landmarks=landmarks, per_pixel=obs.per_pixel * near[:, None] ** 2)
+    _linearised(moved, pose.R, pose.t, whitened, lengths)
     return Errors(whitened[..., :7], whitened[..., 7], *lengths.T)
 
 

@@ -56,6 +56,20 @@ def said_to_be(views, sigma):
     return replace(views, landmarks=replace(views.landmarks, sigma=np.full(len(views.landmarks.sigma), sigma)))
 
 
+def above_flat_ground(seed, n=400, disparity=6.0, noise=0.2):
+    """A segment of a camera that looks straight down from afar, as a drone's does; every point has one true depth."""
+    rng = np.random.default_rng(seed)
+    key = rng.uniform([20, 120], [580, 380], (n, 2))
+    depth, rays = 500.0 * 0.2 / disparity, CAMERA.rays(key)
+    measured = disparity + noise * rng.standard_normal(n)
+    T = [RigidTransform(np.eye(3), np.array([0.0, 0.04 * depth, 0.0]) * k) for k in range(1, 5)]
+    pixels = np.array([CAMERA.project(P.apply(rays * depth)) for P in T]) + noise * rng.standard_normal((4, n, 2))
+    Z = (500.0 * 0.2 / measured)[:, None]
+    known = Landmarks(rays * Z, rays * Z / measured[:, None], np.full(n, noise), 1.0 / measured)
+    R, t = np.array([P.rotation for P in T]), np.array([P.translation for P in T])
+    return SegmentTracks(known, pixels, np.ones((4, n), bool), CAMERA), SegmentState(R, t, np.zeros(n))
+
+
 def error_of(state, T):
     return float(
         np.sqrt(
@@ -70,6 +84,15 @@ def moved(state, step, depth=0.0, bias=0.0):
     """The state after steps of poses (frame, 6), depths and bias."""
     R, t = perturbed(state.R, state.t, step)
     return SegmentState(R, t, state.depth + depth, state.bias + bias)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_scene_of_one_depth_keeps_its_scale(seed):
+    tracks, true = above_flat_ground(seed)
+    found = adjust(tracks, true, PARAMS).state
+    # The mean of 400 disparities is known to 0.2 % of them.
+    assert np.linalg.norm(found.t[-1]) == pytest.approx(np.linalg.norm(true.t[-1]), rel=0.01)
+    assert abs(found.bias) < 0.1 * PARAMS.bias_sigma
 
 
 def test_gradient_is_that_of_the_cost():

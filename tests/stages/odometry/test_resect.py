@@ -1,5 +1,7 @@
 """Resection: Eq. 4, 5, 7, 8; Jacobian; exact, noisy and contaminated data; covariance; degenerate cases by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pointing_angles import angles_from_rotation, rotation_from_angles
@@ -48,14 +50,15 @@ def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0
     return resect(known, pixels, CAMERA, [RigidTransform.identity()], params.model_copy(update={"seed": seed}), 7)
 
 
-def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2):
+def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2, share=0.0):
     """Observations by the camera of these tests."""
-    return Observations(landmarks, per_pixel, sigma, pixels, Pinhole.of(CAMERA), pixel_sigma)
+    shares = np.full(len(sigma), share)
+    return Observations(landmarks, per_pixel, sigma, shares, pixels, Pinhole.of(CAMERA), pixel_sigma)
 
 
 def segment_poses(points, landmarks, key, frames):
     """Points of a segment, whose landmarks are exact, and its poses."""
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), {"too far": 3})
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), lost={"too far": 3})
     given = SegmentPoints(points, known, CAMERA, key)
     return given, resect_segment(given, frames, PARAMS)
 
@@ -78,19 +81,22 @@ def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t()
     np.testing.assert_allclose(angles_from_rotation(found.T_local_left.rotation.T), (omega, phi, kappa), atol=1e-9)
 
 
-def test_jacobian_against_central_differences():
+@pytest.mark.parametrize("share", [0.0, 2.0])
+def test_jacobian_against_central_differences(share):
     rng = np.random.default_rng(1)
     landmarks = scene(rng, 5)
     per_pixel = 0.1 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
     sigma = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
     T = true_pose(rng).inverse()
     pixels = rng.uniform(0, 500, (5, 2))
-    errors = back_projection(observed(landmarks, per_pixel, sigma, pixels, 0.3), Pose(T.rotation, T.translation, 0.05))
+    obs = observed(landmarks, per_pixel, sigma, pixels, 0.3, share)
+    errors = back_projection(obs, Pose(T.rotation, T.translation, 0.05))
 
     def plain(step):
         """Errors in pixels after a step of pose and bias."""
         R, t = perturbed(T.rotation[None], T.translation[None], step[None, :6])
-        return CAMERA.project((landmarks + (0.05 + step[6]) * per_pixel) @ R[0].T + t[0]) - pixels
+        bias = 0.05 + step[6]
+        return CAMERA.project((landmarks + bias / (1.0 - share * bias) * per_pixel) @ R[0].T + t[0]) - pixels
 
     numeric = np.array([(plain(e) - plain(-e)) / 2e-6 for e in 1e-6 * np.eye(7)])
     along = numeric[6] * sigma[:, None]
@@ -121,6 +127,16 @@ def test_exact_data_give_the_exact_pose():
         np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
         assert found.inlier.all()
         assert found.residual.max() < 1e-6
+
+
+@pytest.mark.parametrize("column", [-900.0, 1600.0])
+def test_images_cut_beside_the_axis_are_posed(column):
+    rng = np.random.default_rng(2)
+    T, landmarks, moved = true_pose(rng), scene(rng), [column - CAMERA.cx, 0.0]
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)))
+    given = seen(T, landmarks) + moved, replace(CAMERA, cx=column), [RigidTransform.identity()]
+    found = resect(known, *given, PARAMS, 7)
+    np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
 
 
 def test_large_motion_needs_no_good_start():
