@@ -264,8 +264,10 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     if units == {""} and np.abs(values).max() > 2 * np.pi:
         values, units = np.deg2rad(values), {"deg"}
     if len(units) != 1 or units == {""}:
-        text = f"{table.name}: roll, pitch and yaw have {'two units' if units - {''} else 'no unit'}"
-        remedy = "name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad"
+        names = " and ".join(table.header[place] for place in places) or "roll, pitch and yaw"
+        text = f"{table.name}: {'units of' if units - {''} else 'no unit is stated for'} {names}"
+        text += " differ" if units - {""} else ""
+        remedy = "write it behind their names, as yaw_deg or yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
     turns = Rotation.from_euler("ZYX", values[:, ::-1])
