@@ -25,7 +25,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
-from rille.stages.geometry.rigid import compose
+from rille.stages.geometry.rigid import compose, lengths_along
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
@@ -172,7 +172,7 @@ def adjust_stage(
     known, excess, lengths = chain.beside(stated), 1.0, np.zeros(2)
     for nodes, inside, done in adjusted_pieces(own, apart, known, sensors):
         excess = max(excess, done.graph.excess)
-        lengths += [_length(poses) for poses in (own.poses[nodes], done.state.poses[:-1])]
+        lengths += [lengths_along(poses[:, :, 3])[-1] for poses in (own.poses[nodes], done.state.poses[:-1])]
         sources = known.shared.shape[2]
         _write(out, posed[nodes], done, slice(sources - calibration, sources))
         for k in np.flatnonzero(~done.kept[: len(inside)]):
@@ -187,11 +187,6 @@ def adjust_stage(
     # Some hold for several pieces alike.
     lines = list(dict.fromkeys([*lines, *sensors.lines]))
     return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts})
-
-
-def _length(poses: Floats) -> float:
-    """Sum of the steps, m, between successive poses (n, 3, 4)."""
-    return float(np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1).sum())
 
 
 Piece = tuple[NDArray[np.intp], NDArray[np.intp], Adjusted]
