@@ -265,8 +265,7 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
         values, units = np.deg2rad(values), {"deg"}
     if len(units) != 1 or units == {""}:
         names = " and ".join(table.header[place] for place in places) or "roll, pitch and yaw"
-        text = f"{table.name}: {'units of' if units - {''} else 'no unit is stated for'} {names}"
-        text += " differ" if units - {""} else ""
+        text = f"{table.name}: the angles {names} have {'two units' if units - {''} else 'no unit'}"
         remedy = "write it behind their names, as yaw_deg or yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
