@@ -208,8 +208,8 @@ def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
     """The pose of random samples of landmarks that most others are within ``threshold`` pixels of; none of few."""
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % 2**31
-    size = (2 * round(obs.camera.cx) + 2, 2 * round(obs.camera.cy) + 2)  # plays no part, but must be there
-    camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=list(obs.camera))
+    # The size plays no part, but must be there.
+    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(obs.camera))
     answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks, camera, options)
     return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
 

@@ -1,5 +1,7 @@
 """Resection: Eq. 4, 5, 7, 8; Jacobian; exact, noisy and contaminated data; covariance; degenerate cases by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pointing_angles import angles_from_rotation, rotation_from_angles
@@ -121,6 +123,15 @@ def test_exact_data_give_the_exact_pose():
         np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
         assert found.inlier.all()
         assert found.residual.max() < 1e-6
+
+
+def test_the_principal_point_may_lie_outside_of_the_image():
+    rng, cut = np.random.default_rng(2), np.array([500.0, 400.0])
+    T, landmarks = true_pose(rng), scene(rng)
+    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)))
+    camera = replace(CAMERA, cx=CAMERA.cx - cut[0], cy=CAMERA.cy - cut[1])
+    found = resect(known, seen(T, landmarks) - cut, camera, [RigidTransform.identity()], PARAMS, 7)
+    np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
 
 
 def test_large_motion_needs_no_good_start():
