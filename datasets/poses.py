@@ -265,8 +265,9 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     if stated == {""} and np.abs(values).max() > 2 * np.pi:
         values, stated = np.deg2rad(values), {"deg"}
     if len(stated) != 1 or stated == {""}:
-        text = f"{table.name}: roll, pitch and yaw have {'two units' if stated - {''} else 'no unit'}"
-        remedy = "name the columns roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad"
+        names = " and ".join(table.header[place] for place in places) or "roll, pitch and yaw"
+        text = f"{table.name}: the angles {names} have {'two units' if stated - {''} else 'no unit'}"
+        remedy = "write it behind their names, as yaw_deg or yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
     turns = Rotation.from_euler("ZYX", values[:, ::-1])

@@ -24,6 +24,8 @@ MAX_NAMED = 3
 """Models that a warning names."""
 MAX_LISTED = 500
 """Seams in the result, the worst first: a long sequence has tens of thousands."""
+MIN_IN_METRES = 0.1
+"""Error, m, from which on it is stated in metres, smaller ones in millimetres."""
 
 
 class OverlapAuditParams(Params):
@@ -82,10 +84,11 @@ def describe(model: Facts) -> str:
     tilts = [math.degrees(t) for t in model["tilt"]]
     against = "pairs" if len(model["neighbours"]) > 1 else "pair"
     names = ", ".join(str(n) for n in model["neighbours"][:4]) + (", ..." if len(model["neighbours"]) > 4 else "")
+    unit, per_m = ("mm", 1000.0) if model["systematic"] < MIN_IN_METRES else ("m", 1.0)
+    off, expected, bias = (per_m * model[name] for name in ("systematic", "expected", "bias"))
     words = (
-        f"pair {model['pair']} against {against} {names}: {1000 * model['systematic']:.2g} mm where sigma allows "
-        f"{1000 * model['expected']:.2g} mm (offset {1000 * model['bias']:+.2g} mm, tilt {tilts[0]:+.2g} deg along x, "
-        f"{tilts[1]:+.2g} deg along y)"
+        f"pair {model['pair']} against {against} {names}: {off:.2g} {unit} where sigma allows {expected:.2g} {unit} "
+        f"(offset {bias:+.2g} {unit}, tilt {tilts[0]:+.2g} deg along x, {tilts[1]:+.2g} deg along y)"
     )
     return words + (", either may be wrong" if model["either"] else "")
 

@@ -110,8 +110,9 @@ def test_angles_beyond_a_turn_can_only_be_degrees(tmp_path):
 @pytest.mark.parametrize(
     ("text", "format", "expected"),
     [
-        ("time,roll,pitch,yaw\n0,0.1,0,0\n", "auto", ("RIL-265",)),
-        ("time,roll_deg,pitch_rad,yaw_deg\n0,0.1,0,0\n", "auto", ("RIL-265",)),
+        ("time,roll,pitch,yaw\n0,0.1,0,0\n", "auto", ("RIL-265", "angles roll and pitch and yaw have no unit")),
+        ("time,roll_deg,pitch_rad,yaw_deg\n0,0.1,0,0\n", "auto", ("RIL-265", "two units")),
+        ("time,x,y,theta\n0,1,2,0.1\n", "auto", ("RIL-265", "angles theta have no unit", "yaw_rad")),
         (f"1 1 2 3 0 0 {H} {H}\n2 1 2 3 0 0 0 2\n", "tum", ("RIL-266", "line 2")),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 2 0 0 0 0 2 0\n", "kitti", ("RIL-333", "line 2")),
         ("1 2 3 4\n", "auto", ("RIL-264", "4 numbers")),

@@ -19,6 +19,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.read_dem import DemFile, crs_name
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
+from rille.pipeline.report.words import metres
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
@@ -263,4 +264,4 @@ def _lines(figures: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _line(f: dict[str, float]) -> str:
-    return "  ".join(f"{words} {1e3 * f[k]:.3g} mm" for k, words in WORDS.items() if k in f)
+    return "  ".join(f"{words} {metres(f[k])}" for k, words in WORDS.items() if k in f)

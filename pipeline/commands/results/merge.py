@@ -19,6 +19,7 @@ from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, check_folder, write_raster
+from rille.pipeline.report.words import metres
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
@@ -211,11 +212,11 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
 def _line(one: Session) -> str:
     """How a run was laid, and how far it differs."""
     x, y, z = one.pose.translation
-    overlap, (a, b, c) = one.facts["overlap"], 1e3 * one.sigma[:3]
+    overlap = one.facts["overlap"]
     turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])
-    sigma = f"sigma {a:.2g}, {b:.2g}, {c:.2g} mm, {turn:.2g} degrees; by {one.facts['by']}"
-    median, nmad, p95 = (1e3 * overlap[name] for name in ("median", "nmad", "p95"))
+    sigma = f"sigma {', '.join(map(metres, one.sigma[:3]))}, {turn:.2g} degrees; by {one.facts['by']}"
+    median, nmad, p95 = (metres(overlap[name]) for name in ("median", "nmad", "p95"))
     return (
         f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); "
-        f"{overlap['cells']:.0f} cells in common: median {median:+.2g} mm, NMAD {nmad:.2g} mm, 95 % {p95:.2g} mm"
+        f"{overlap['cells']:.0f} cells in common: median {median}, NMAD {nmad}, 95 % {p95}"
     )

@@ -25,7 +25,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
-from rille.stages.geometry.rigid import compose
+from rille.stages.geometry.rigid import compose, lengths_along
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
@@ -33,6 +33,9 @@ from rille.stages.odometry.resection.trajectory import Chained, ChainLink, accou
 
 MIN_WAY_SHARE = 0.03
 """Of the chain's ways along a direction, over those along the main one, for it to tell errors along that direction."""
+
+MIN_LONGER = 0.01
+"""Change of the camera's ways by other sensors, as a share, that is worth a word."""
 
 
 def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
@@ -166,16 +169,21 @@ def adjust_stage(
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
-    known, excess = chain.beside(stated), 1.0
+    known, excess, lengths = chain.beside(stated), 1.0, np.zeros(2)
     for nodes, inside, done in adjusted_pieces(own, apart, known, sensors):
         excess = max(excess, done.graph.excess)
+        lengths += [lengths_along(poses[:, :, 3])[-1] for poses in (own.poses[nodes], done.state.poses[:-1])]
         sources = known.shared.shape[2]
         _write(out, posed[nodes], done, slice(sources - calibration, sources))
         for k in np.flatnonzero(~done.kept[: len(inside)]):
             ends = np.searchsorted(nodes, known.ends[inside[k]])
             lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends]))
     if excess > 1.0:
-        lines.append(f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that")
+        text = f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that"
+        if abs((longer := lengths[1] / max(lengths[0], 1e-12)) - 1.0) > MIN_LONGER and sensors.used:
+            text += f"; by {' and '.join(f'[{name}]' for name in sensors.used)} its ways are {longer:.3f} times as long"
+            text += ", elevations are not: correct the baseline, or the sensor's unit and scale"
+        lines.append(text)
     # Some hold for several pieces alike.
     lines = list(dict.fromkeys([*lines, *sensors.lines]))
     return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts})

@@ -174,9 +174,9 @@ class Sensors:
             if np.mean(kept) < MAJORITY:
                 why = f"{(~kept).sum()} of its {len(kept)} measurements contradict the others"
             elif worst >= 0 and abs(shared[worst]) > MAX_SHARED_SIGMAS:
-                why = (
-                    f"its {self.used[name].shared_errors[worst]} is off by {abs(shared[worst]):.0f} standard deviations"
-                )
+                error = self.used[name].shared_errors[worst]
+                off = abs(float(shared[worst]))
+                why = f"its {error.name} is off by {off * error.sigma:.2g}{error.unit}, {off:.0f} standard deviations"
             if why:
                 refused = True
                 self._refuse(name, why)

@@ -13,9 +13,9 @@ is nearest to a (Schoenemann 1966, doi:10.1007/BF02289451): they show a turned m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,10 +65,21 @@ class OwnTrajectory(NamedTuple):
         return OwnTrajectory._make(values[nodes] for values in self)
 
 
-class Sensor(Protocol):
-    """One sensor; ``shared_errors`` are its sources before that of its clock, in words."""
+class SharedError(NamedTuple):
+    """What all measurements of a sensor share, in words, and its standard deviation in a unit."""
 
-    shared_errors: ClassVar[tuple[str, ...]]
+    name: str
+    sigma: float
+    unit: str
+
+
+class Sensor(Protocol):
+    """One sensor."""
+
+    @property
+    def shared_errors(self) -> Sequence[SharedError]:
+        """Its sources before that of its clock."""
+        ...
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own trajectory contradicts it; empty: it does not."""
@@ -152,12 +163,16 @@ class RelativePrior:
     each metre of way.
     """
 
-    shared_errors: ClassVar[tuple[str, ...]] = ("scale", "turn about x", "turn about y", "turn about z")
-
     poses: Floats
     times: Floats | None
     drift: float
     turn: float
+
+    @property
+    def shared_errors(self) -> Sequence[SharedError]:
+        """Scale and turn of dead reckoning."""
+        turns = (SharedError(f"turn about {axis}", math.degrees(self.turn), " degrees per metre") for axis in "xyz")
+        return SharedError("scale", 100.0 * self.drift, " %"), *turns
 
     def _at(self, rows: NDArray[np.intp], shift: float) -> Floats:
         """Poses (n, 3, 4) of some frames by the sensor ``shift`` seconds later."""
@@ -240,14 +255,13 @@ class PositionPrior:
     left camera's frame; ``clocked``: its clock is one of its own; ``laid``: how positions are laid on the world.
     """
 
-    shared_errors: ClassVar[tuple[str, ...]] = ("lever arm along x", "lever arm along y", "lever arm along z")
-
     positions: Floats
     times: Floats
     sigma: Floats
     lever: Floats
     clocked: bool
     laid: RigidTransform = field(default_factory=RigidTransform.identity)
+    shared_errors = tuple(SharedError(f"lever arm along {axis}", LEVER_SIGMA_M, " m") for axis in "xyz")
 
     @staticmethod
     def of(given: Mapping[str, Any], *, clocked: bool) -> PositionPrior:
@@ -308,10 +322,9 @@ class PositionPrior:
 class VerticalPrior:
     """Direction of ``up`` (frame, 3) in the left cameras, NaN of none, with its standard deviation, rad."""
 
-    shared_errors: ClassVar[tuple[str, ...]] = ()
-
     up: Floats
     sigma: float
+    shared_errors = ()
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's turns contradict the direction of up; empty: they do not."""

@@ -137,7 +137,7 @@ def test_alignment_is_told_and_never_silent(tmp_path: Path, capsys: pytest.Captu
     assert abs(found["figures"]["bias"]) < 1e-6
     printed = capsys.readouterr().out
     assert "aligned (tilt): A was moved by z_m -0.25" in printed
-    assert "before  RMSE 250 mm" in printed
+    assert "before  RMSE 0.250 m " in printed
 
 
 def test_georeferenced_runs_compare_in_their_own_system(tmp_path: Path) -> None:

@@ -123,6 +123,7 @@ WRONG = {
     "turned": (lambda truth, rng: odometry(truth, rng, mount=TURNED), ("turned by 9", "T_body_left")),
     "axes": (lambda truth, rng: odometry(truth, rng, mount=AXES), ("T_body_left",)),
     "unit": (lambda truth, rng: odometry(truth, rng, scale=1.3), ("multiplied by 0.7", "unit")),
+    "scale": (lambda truth, rng: odometry(truth, rng, scale=1.1), ("its scale is off by 8.7 %, 4 ")),
     "attitude turned": (
         lambda truth, rng: rotations(truth, rotation_exp([0.2, 0, 0])),
         ("turned by 1",),
@@ -196,6 +197,16 @@ def test_positions_that_are_off_for_a_while_are_left_out():
     out = adjusted(segments, before, gnss(truth, rng, sigma=0.1, jump=2.0))
     assert out.meta["priors"]["positions"]["left_out"] == 6
     assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.03])
+def test_positions_that_lengthen_the_cameras_ways_are_said_to(scale):
+    truth, rng = winding(), np.random.default_rng(5)
+    segments, before = run_of(truth, rng)
+    longer = [RigidTransform(T.rotation, scale * T.translation) for T in truth]
+    lines = adjusted(segments, before, gnss(longer, rng, sigma=0.05)).meta["warnings"]
+    said = [line for line in lines if "by [positions] its ways are 1.02" in line and "baseline" in line]
+    assert len(said) == (scale != 1.0)
 
 
 def test_positions_say_where_the_world_lies():

@@ -71,6 +71,11 @@ def test_a_model_beyond_its_sigma_is_warned_of_by_name_and_figure() -> None:
     assert PLANTED in (meta["seams"][0]["pair"], meta["seams"][0]["other"])
 
 
+def test_a_model_that_is_far_off_is_stated_in_metres() -> None:
+    (line,) = audited(along(7, bias={PLANTED: 1.5}))[1]["warnings"]
+    assert [fact for fact in ("1.5 m where", "offset +1.5 m") if fact not in line] == []
+
+
 def test_of_two_models_nobody_can_tell_which_is_wrong() -> None:
     _, meta = audited(along(2, bias={4: 0.01}))
     assert "either may be wrong" in meta["warnings"][0]
