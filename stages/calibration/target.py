@@ -21,6 +21,7 @@ from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.rigid import angle
 from rille.stages.numeric.least_squares import levenberg_marquardt
 
 MODELS: Mapping[str, tuple[str, ...]] = {
@@ -403,6 +404,6 @@ def _vector(T: RigidTransform) -> Floats:
 
 def _apart(a: RigidTransform, b: RigidTransform) -> float:
     """How far two poses differ: angle in radians, and position relative to its size."""
-    angle = float(np.linalg.norm(cv2.Rodrigues(a.rotation @ b.rotation.T)[0]))
     size = float(np.linalg.norm(a.translation) + np.linalg.norm(b.translation))
-    return angle + float(np.linalg.norm(a.translation - b.translation)) / max(size, 1e-12)
+    away = float(np.linalg.norm(a.translation - b.translation)) / max(size, 1e-12)
+    return float(angle(a.rotation @ b.rotation.T)) + away

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import AnyArray
 from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 
 NEIGHBOURS = 12
 """Number of tracks that an affinity is fitted to: four times the three that it needs, and still local."""
@@ -72,13 +73,13 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     shift = (q - p)[near] - offset @ (common - np.eye(2)).T
     count = near.shape[1]
 
-    def cauchy(residual: Floats) -> Floats:
-        weight = 1.0 / (1.0 + residual**2)
+    def weights(residual: Floats) -> Floats:
+        weight = cauchy(residual, 1.0)
         # The pull is that of a spread in pixels whatever the neighbours' weights.
         return np.asarray(weight * count / weight.sum(-1, keepdims=True))
 
     design = np.concatenate([offset, np.ones((n, count, 1))], -1)
-    fitted = irls(design, shift, cauchy, count * np.diag([PULL**2, PULL**2, 0.0]), rounds=4)
+    fitted = irls(design, shift, weights, count * np.diag([PULL**2, PULL**2, 0.0]), rounds=4)
     return common + np.swapaxes(fitted[:, :2], 1, 2), fitted[:, 2]
 
 
