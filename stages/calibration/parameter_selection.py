@@ -10,7 +10,8 @@ parameter is freed only if
 2. it is *contradicted*: it differs from the calibration by several of its standard deviations, and a wrong principal
    point is not the likelier cause. The principal point is the likelier cause if a single angle departs alone. Where one
    angle departs, the camera was turned, and of the other angles one standard deviation is enough;
-3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration.
+3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration, or another
+   angle departs and this one contradicts its calibration, too.
 
 All other parameters stay exactly as given. Angles are tested before the direction of the baseline, because mounts turn
 rather than shift.
@@ -257,14 +258,16 @@ class _Chooser:
                 f"which is {100 * depth:.1f} % of depth"
             )
         # Of a rig that was turned nothing says that its other angles are those of the calibration.
-        if abs(value) < (1.0 if i < ANGLES and self._turned(i, chosen) else p.significance) * sigma:
+        turned, contradicted = i < ANGLES and self._turned(i, chosen), abs(value) >= p.significance * sigma
+        if not contradicted and not (turned and abs(value) >= sigma):
             return f"not contradicted: the images say {found}"
         if not self._knocked(i, chosen):
             return (
                 f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
                 f"say {found}, which is {100 * depth:.1f} % of depth"
             )
-        if rows < p.least_rows and depth < MIN_DEPTH_CHANGE:
+        # Held, a small turn that is certain would pass into the other angles.
+        if rows < p.least_rows and depth < MIN_DEPTH_CHANGE and not (turned and contradicted):
             return f"not worth it: the images say {found}, which moves rows by {rows:.2f} px, depth by {depth:.2%}"
         return None
 
