@@ -334,7 +334,7 @@ def test_compare_dem(place: Place, tmp_path: Path) -> None:
     assert first.last == "dem_comparison.tif  dem_comparison.json"
     found = contents(tmp_path)
     assert set(found) == {"dem_comparison.tif", "dem_comparison.json"}
-    assert "RMSE 0 mm" in first.out
+    assert "RMSE 0 m" in first.out
     assert place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path) == first
     assert contents(tmp_path) == found
 
