@@ -264,4 +264,7 @@ def test_why_claims_are_not_judged_is_said() -> None:
     singular[3, 5, 5] = 0.0
     assert "the first posed frame" in nees(poses, late, claimed)["nees"]
     assert "the first posed frame" in nees(poses[:1], poses[:1], claimed[:1])["nees"]
+    figure = trajectory_accuracy(poses, late, claimed, (0.1, 0.01))[1]["nees"]
+    assert figure["value"] is None
+    assert "the first posed frame" in figure["how"]
     assert "singular" in nees(poses, poses, singular)["nees"]
