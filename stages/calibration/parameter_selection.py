@@ -194,9 +194,14 @@ class _Chooser:
         fit = settle(self.rig, self.pairs, free, self.priors)
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
+    def _moves(self, correction: Floats) -> tuple[float, float]:
+        """What a correction (5,), radians, does to the rows, pixels RMS, and to depth, relative."""
+        rows, depth = (math.sqrt(float(correction @ form @ correction)) for form in (self.rows, self.depth))
+        return rows, depth
+
     def _worth(self, correction: Floats) -> bool:
         """Whether a correction (5,) moves rows or depth by more than the usual error of a good calibration."""
-        rows, depth = (math.sqrt(float(correction @ moved @ correction)) for moved in (self.rows, self.depth))
+        rows, depth = self._moves(correction)
         # Points beyond infinity prove that depth is wrong, so a correction of any size counts.
         return self.impossible or rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE
 
@@ -247,7 +252,7 @@ class _Chooser:
         """Why a parameter is held; None where it is to be freed."""
         p = self.params
         value, sigma = self._estimate(i, chosen)
-        rows, depth = (abs(value) * math.sqrt(float(moved[i, i])) for moved in (self.rows, self.depth))
+        rows, depth = self._moves(value * np.eye(RIG)[i])
         found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
         error = self._depth_error(i, chosen)
         if error > MAX_DEPTH_ERROR and not self._infinity(i, chosen):
@@ -288,10 +293,10 @@ class _Chooser:
         sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self._held(chosen))[i, i]))
         value = float(fit.x[i])
         asked, certain = self._estimate(i, others)
+        rows, depth = self._moves(value * np.eye(RIG)[i])
         why = (
             f"contradicted: {abs(asked) / certain:.0f} times the images' own error, without that of what is held; it "
-            f"moves rows by {abs(value) * math.sqrt(float(self.rows[i, i])):.2f} px, depth by "
-            f"{abs(value) * math.sqrt(float(self.depth[i, i])):.2%}"
+            f"moves rows by {rows:.2f} px, depth by {depth:.2%}"
         )
         return Parameter(NAMES[i], value, value, sigma, observed, True, why)
 

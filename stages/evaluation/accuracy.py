@@ -77,7 +77,7 @@ def trajectory_accuracy(
         how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
         if any(sigma):
             how += f"; with {sigma[0]:g} m and {math.degrees(sigma[1]):g} degrees of the truth itself"
-        total = covariance + _of_truth(estimate[:, :, 3] - estimate[start, :, 3], sigma)
+        total = covariance + _truth_covariance(estimate[:, :, 3] - estimate[start, :, 3], sigma)
         values = nees(estimate, aligned, total)
         figures |= {name: metric(values[name], "", how + whose) for name, _, whose in CLAIMS}
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
@@ -144,7 +144,7 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     return {"scale_error": metric(100.0 * (scale - 1.0), "%", how)}
 
 
-def _of_truth(away: Floats, sigma: Sequence[float]) -> Floats:
+def _truth_covariance(away: Floats, sigma: Sequence[float]) -> Floats:
     """Covariances (n, 6, 6) of (position m, rotation rad) of true poses that lie ``away`` (n, 3), m, from the first.
 
     The first was made equal to the estimate. Each has errors of its own; those of the first one move all others, and
