@@ -196,8 +196,6 @@ def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     off = {}
     for part in ("position", "rotation"):
         nees = _value(figures, f"trajectory_nees_{part}")
-        # What a wrong mounting of the truth adds is no error of the poses.
-        nees = _value(figures, f"trajectory_hand_eye_nees_{part}") or nees
         if nees is not None and nees > MAX_SIGMA_RATIO**2:
             off[part] = f"{part}s by about {number(math.sqrt(nees), 2)} times"
     if not off:
