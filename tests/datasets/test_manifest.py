@@ -645,9 +645,9 @@ def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
         ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
-            r"principal point \(315, 23\.5\) px is far from .* scaled or cut",
+            r"principal point \(315, 23\.5\) px is 442 % of the width off the centre .* cut or scaled",
         ),
-        ({"cameras": "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"}, r"were images scaled to 0\.5 of their size"),
+        ({"cameras": "[cameras]\nfx = 60.0\ncx = 35.0\ncy = 23.5\n"}, r"px is 5 % of the width off the centre"),
         ({"cameras": CAMERAS + "fy = 120.0\n"}, r"fx = 60 and fy = 120 px differ much"),
     ],
 )
@@ -655,6 +655,17 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     warnings = opened(write_sequence(tmp_path, **parts)).warnings
     assert any(re.search(line, w) for w in warnings)
     assert len(warnings) <= 2
+
+
+def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_the_figures_are_said(tmp_path):
+    of_twice_the_size = "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"
+    with raises("RIL-974", "some 128 x 96 pixels, the images are 64 x 48", "cx and cy times 0.5"):
+        opened(write_sequence(tmp_path, cameras=of_twice_the_size))
+    with raises("RIL-131", "fx = 60, fy = 60, cx = 31.5, cy = 23.5"):
+        opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 128\nheight = 96\n"))
+    # It is the images' own: stated as such, or with a lens off the middle of one side.
+    assert opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 64\nheight = 48\n")).warnings
+    assert opened(write_sequence(tmp_path, cameras="[cameras]\nfx = 60.0\ncx = 63.5\ncy = 23.5\n")).warnings
 
 
 @pytest.mark.parametrize("fx", [0.004, 0.1, 1e9])
