@@ -11,6 +11,7 @@ from rille.pipeline.export.view import UNSTATED, TaskRow
 from rille.pipeline.report import delivery, page, summary, terrain_map, words
 from rille.pipeline.report.gather import WorldTerrain
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
 from rille.stages.hazard.vehicle import Vehicle
@@ -197,17 +198,25 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
     """A camera at rest by its images; rates in degrees a second, and gravity off the ground that is seen."""
     run = given(np.zeros((9, 3)), AHEAD, None)
     run.products.trajectory.meta["frames"] = list(range(9))
+    level = RigidTransform(AHEAD, np.zeros(3)).to_list()
+    ground = {"source": "attitude", "T_local_left": level, "plane": None, "ground_share": 0.0}
+    run.products.ground[0].meta.update(ground)
     spun = [Rotation.from_rotvec([0.0, 0.2 * k, 0.0]).as_matrix() for k in range(9)]
-    known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "up": [(0.0, -1.0, 0.0)] * 9, "attitude": spun}
+    known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "pitch": None, "attitude": spun}
     run.sequence.__dict__.update(known)
-    (rates,) = summary._imu(run)
+    (rates,) = summary._sensors(run)
     assert "degrees a second" in rates
     run.products.ground[0].meta["seen_up"] = [0.0, 0.0, -1.0]
     run.sequence.attitude = [np.eye(3)] * 9
-    (gravity,) = summary._imu(run)
+    (gravity,) = summary._sensors(run)
     assert "up is 90 degrees off" in gravity
-    run.sequence.up = None
-    assert summary._imu(run) == []
+    run.sequence.imu_axes = None
+    run.products.ground[0].meta.update(source="pitch")
+    run.sequence.pitch = 0.0
+    (pitch,) = summary._sensors(run)
+    assert "looks down by 90 degrees" in pitch
+    run.products.ground[0].meta.update(source="none")
+    assert summary._sensors(run) == []
 
 
 @pytest.mark.parametrize(("warnings", "told"), [([], 1), (["the truth fits better by another convention"], 0)])
