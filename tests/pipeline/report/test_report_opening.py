@@ -116,6 +116,15 @@ def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
     assert [fact for fact in facts if fact not in told[0]["what"]] == []
 
 
+def test_the_plane_of_the_first_pair_that_has_one_is_told():
+    plane = {"source": "reference plane", "T_local_left": RigidTransform.identity().to_list(), "ground_share": 0.4}
+    view = SimpleNamespace(bundle=lambda handle: handle, products=SimpleNamespace(level={0: None, 3: None}))
+    assert delivery._reference(view) == []
+    view.products.level[3] = Bundle({}, plane)
+    (item,) = delivery._reference(view)
+    assert "the plane that 40% of the scene lies on (normal [0.00, 0.00, 1.00]" in item["why"]
+
+
 def test_what_the_images_contradict_is_told_before_what_failed():
     view = SimpleNamespace(tasks=failed("locus/local/1", "no ground at -0.1"), vehicle_source="", part="")
     view.tasks += failed("locus/local/2", "no ground at 0.25")
