@@ -23,8 +23,8 @@ from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
-from rille.datasets.poses import names_positions, read_positions
-from rille.datasets.text.reading import Search, is_file, read_lines
+from rille.datasets.poses import names_positions, of_images, read_positions
+from rille.datasets.text.reading import Search, is_file
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -313,7 +313,13 @@ def table_kind(path: Path, pairs: int) -> str:
     InputError
         It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
     """
-    read_lines(path, "table")  # refuses what is no text; of other files most are no tables, which is no error
+    # Refuses what is no text; of other files most are no tables, which is no error.
+    if of_images(path):
+        raise InputError(
+            "RIL-976",
+            f"{path} holds poses by COLMAP, at a scale that it need not know",
+            remedy='if they are in metres, state them as [truth] with file = "images.txt"',
+        )
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")

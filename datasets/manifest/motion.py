@@ -7,7 +7,7 @@ import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +18,15 @@ from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
-from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
+from rille.datasets.poses import (
+    TimedPoses,
+    TimedPositions,
+    coverage,
+    interpolate,
+    read_poses,
+    read_positions,
+    refuse_apart,
+)
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
@@ -192,6 +200,8 @@ class MotionReader:
             moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
+        elif timed.images:
+            poses = self.of_images(timed)
         elif len(self.arrived(poses)) in self.counts():
             poses = tuple(self.one_a_pair(self.arrived(poses)))
         else:
@@ -201,6 +211,25 @@ class MotionReader:
             return poses
         T_body_left = RigidTransform.from_matrix(section.T_body_left)
         return tuple(pose and pose @ T_body_left for pose in poses)
+
+    def of_images(self, timed: TimedPoses) -> Poses:
+        """The pose of each left image, by its name in the file; None of one that the file does not name.
+
+        Raises
+        ------
+        InputError
+            It names none of them, or one twice.
+        """
+        known = {PurePosixPath(image).parts: pose for image, pose in zip(timed.images, timed.poses, strict=True)}
+        # By as many of the path's last parts as the file states: COLMAP's names begin at its own folder of images.
+        paths = [pair.left.parts for pair in self.pairs]
+        stated = ([path[k:] for k in range(len(path)) if path[k:] in known] for path in paths)
+        poses = tuple(known[parts[0]] if parts else None for parts in stated)
+        if not any(poses):
+            text = f"{timed.name} has poses of {ends([Path(image) for image in timed.images])}, none of a left image"
+            left = ends([pair.left for pair in self.pairs])
+            raise InputError("RIL-975", f"{self.name}: {text} ({left})", remedy="give the model of these images")
+        return poses
 
     def truth(self, section: Truth) -> None:
         """Poses of each pair, or positions alone with their own times."""

@@ -16,6 +16,7 @@ from raising import raises
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.images.files import Digests
+from rille.datasets.inspection import inspect
 from rille.datasets.manifest import model
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest
@@ -397,6 +398,41 @@ def test_truth_of_a_body_becomes_that_of_the_left_camera(tmp_path):
         assert pose is not None
         np.testing.assert_allclose(pose.translation, [k + 2, 0, 0])
         np.testing.assert_allclose(pose.rotation @ [0, 0, 1], [1, 0, 0])
+
+
+COLMAP = """# Image list with two lines of data per image:
+#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
+#   POINTS2D[] as (X, Y, POINT3D_ID)
+7 {half} 0 {half} 0 0 0 -2 1 {folder}02.png
+1 2 3 4 5 6 7 8 9 1.5 2.5 -1
+3 1 0 0 0 0 0 0 1 {folder}00.png
+
+4 1 0 0 0 -0.3 0 0 2 right/00.png
+1.5 2.5 -1
+"""
+
+
+@pytest.mark.parametrize("folder", ["left/", "", "other/"])
+def test_truth_of_colmap_is_that_of_the_images_that_it_names(tmp_path, folder):
+    path = write_sequence(tmp_path, '[truth]\nfile = "images.txt"\n')
+    (tmp_path / "images.txt").write_text(COLMAP.format(half=math.sqrt(0.5), folder=folder))
+    if folder == "other/":
+        with raises("RIL-975", "02.png"):
+            opened(path)
+        return
+    first, second, third = opened(path).truth
+    assert second is None
+    np.testing.assert_allclose(first.matrix34, np.eye(3, 4))
+    # x_camera = R x_world + t: a quarter turn about y, and the world's origin 2 m behind.
+    np.testing.assert_allclose(third.matrix34, [[0, 0, -1, -2], [0, 1, 0, 0], [1, 0, 0, 0]], atol=1e-9)
+
+
+def test_poses_of_colmap_are_named_to_whoever_has_to_know_their_scale(tmp_path):
+    write_sequence(tmp_path)
+    (tmp_path / "images.txt").write_text(COLMAP.format(half=math.sqrt(0.5), folder="left/"))
+    found = inspect(tmp_path)
+    assert "truth" not in found.tables
+    assert any("poses by COLMAP" in line and "[truth]" in line for line in found.unread)
 
 
 def test_truth_with_a_gap_is_a_warning(tmp_path):
