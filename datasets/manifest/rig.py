@@ -236,7 +236,7 @@ def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: S
         off = max(abs(c.cx - width / 2), abs(c.cy - height / 2)) / width
         if off > (MAX_OFF_CENTRE_OF_UNKNOWN_SIZE if calibrated.size is None else MAX_OFF_CENTRE):
             place = (
-                f"({c.cx:g}, {c.cy:g}) px is {100 * off:.0f} % of the width off the centre of {width} x {height} images"
+                f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height} images"
             )
             lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were they cut or scaled?"))
         if not 0.8 < c.fx / c.fy < 1.25:
