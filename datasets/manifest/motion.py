@@ -165,27 +165,24 @@ class MotionReader:
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
             return unit, [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
-        rows = list(self.arrived(rows))
-        if images or len(rows) not in self.counts():
+        taken = None if images else self.one_a_pair(rows)
+        if taken is None:
             more = f", none of {absent}" if by_name else ""
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
             raise IncompleteError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
-        return unit, self.one_a_pair(rows)
+        return unit, taken
 
-    def counts(self) -> set[int]:
-        """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
-        return {len(self.pairs), sum(not pair.absent for pair in self.pairs)}
+    def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None] | None:
+        """One row a pair, or, where there are rows for whole pairs alone, None for the others; None: of other pairs.
 
-    def arrived(self, rows: Sequence[Row]) -> Sequence[Row]:
-        """The rows without those for images that are still to come."""
-        return rows[: len(self.pairs)] if self.growing else rows
-
-    def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None]:
-        """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
-        remaining = iter(rows)
-        partly = len(rows) < len(self.pairs)
-        return [None if partly and pair.absent else next(remaining) for pair in self.pairs]
+        Rows for images that are still to come are left out.
+        """
+        rows = rows[: len(self.pairs)] if self.growing else rows
+        if len(rows) == len(self.pairs):
+            return list(rows)
+        remaining, whole = iter(rows), sum(not pair.absent for pair in self.pairs)
+        return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
     def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
         """T_reference_left of each pair from a file of poses of a body."""
@@ -202,8 +199,8 @@ class MotionReader:
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
         elif timed.images:
             poses = self.of_images(timed)
-        elif len(self.arrived(poses)) in self.counts():
-            poses = tuple(self.one_a_pair(self.arrived(poses)))
+        elif (rows := self.one_a_pair(poses)) is not None:
+            poses = tuple(rows)
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
@@ -287,7 +284,7 @@ class MotionReader:
             times = tuple(t + section.time_offset for t in found.times)
             refuse_apart(times, self.sequence.times, found.name)
             return found.positions, times
-        rows = tuple(self.arrived(found.positions))
+        rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         if len(rows) != len(self.pairs):
             text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
             remedy = "give one a pair, or times of both ([times] of the pairs)"
