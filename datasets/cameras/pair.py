@@ -117,7 +117,7 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
         remedy = "give the images as they were calibrated, or the calibration of images of this size"
         if camera.size == size[::-1]:
             remedy += " (turned by their tag: magick mogrify -auto-orient FILES)"
-        elif height * scale == size[1]:
+        elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
             # The centre of the first pixel is 0: its corner stays where it is.
             cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
             focal = f"fx = {c.fx * scale:.8g}, fy = {c.fy * scale:.8g}"
