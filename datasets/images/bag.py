@@ -17,7 +17,7 @@ from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.files import Grey
 from rille.datasets.images.headers import Header, read_header
-from rille.datasets.text.reading import MOST_MEMORY, bounded_memory, open_regular
+from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.imaging.levels import spread
@@ -77,13 +77,10 @@ def opened(path: Path) -> Iterator[Any]:
             open_regular(file, "bag", sys.maxsize).close()
     try:
         # bags of ROS 2 before Iron hold no definitions of their messages
-        with bounded_memory(), AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except RilleError:
         raise
-    except MemoryError as error:
-        text = f"{path} unpacks to more than {MOST_MEMORY / 1e9:g} GB at once"
-        raise InputError("RIL-996", text, remedy="check that it is the right file, or record it anew") from error
     except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
         reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         text = f"{path} cannot be read as a bag: {reason}"

@@ -9,12 +9,10 @@ from __future__ import annotations
 import fnmatch
 import os
 import re
-import resource
 import stat
 import tomllib
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from io import BufferedReader
 from itertools import islice, pairwise
 from pathlib import Path
@@ -39,9 +37,6 @@ DEEPEST = 20
 
 MOST_ENTRIES = 300_000
 """Files and folders that are looked at in a search; a walk over them takes two or three seconds."""
-
-MOST_MEMORY = 4 * 10**9
-"""Bytes that reading may take of what other packages unpack: a chunk of a bag has megabytes."""
 
 GREATEST = 1e20
 """Beyond any measurement in any unit: numbers below it can be squared, and multiplied, and stay finite."""
@@ -95,21 +90,6 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
         raise InputError("RIL-820", text, remedy="fetch it: git lfs pull, or git annex get")
     size = f"{status.st_size / 1e6:.1f} MB, at most {most / 1e6:g} MB are read"
     raise InputError("RIL-139", f"{what} {path} is too large: {size}", remedy="check that it is the right file")
-
-
-@contextmanager
-def bounded_memory() -> Iterator[None]:
-    """Let this process take no more than ``MOST_MEMORY`` in addition; then it meets a MemoryError. On Linux alone."""
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    with suppress(OSError, ValueError):  # no such file on other systems; a lower limit of the system's stays
-        taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-        soft = taken + MOST_MEMORY
-        if before[0] == resource.RLIM_INFINITY or soft < before[0]:
-            resource.setrlimit(resource.RLIMIT_AS, (soft, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def mark(status: os.stat_result) -> str:
