@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
 from rille.stages.odometry.resection.sensors import (
     MIN_FIXES,
@@ -36,6 +36,8 @@ MIN_LATE_S = 0.005
 """Offset of a clock that is not worth a word."""
 MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
+MIN_LEAN = math.radians(0.05)
+"""Of the world against the vertical that is not worth a word: 1 mm a metre."""
 MAX_SHARED_SIGMAS = 4.0
 """Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
 REMEDY = {
@@ -44,6 +46,7 @@ REMEDY = {
     "positions": "correct columns, unit, lever_arm or time_offset, or raise sigma",
     "up": "correct T_body_left (T_imu_left), the order of its columns or up, or raise sigma_deg",
 }
+UNLEVEL = "positions are turned about the vertical alone, and nothing tells of the vertical"
 
 
 class Clock(NamedTuple):
@@ -97,16 +100,19 @@ class Sensors:
             used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
         return Sensors(used, times, timed, bool(given.get("georeferenced", False)))
 
-    def believe(self, own: OwnTrajectory) -> None:
-        """Leave out the sensors that contradict the camera's own chain, and say so."""
+    def believe(self, own: OwnTrajectory, *, upright: bool) -> None:
+        """Leave out the sensors that contradict the camera's own chain, and say so; ``upright``: its z is known."""
         for name, sensor in list(self.used.items()):
             if reason := sensor.contradiction(own):
-                self._refuse(name, reason, "contradicts the images and ")
+                if name == "positions" and not upright:
+                    self._refuse(name, UNLEVEL, "", "state world.up")
+                else:
+                    self._refuse(name, reason, "contradicts the images and ")
 
-    def _refuse(self, name: str, reason: str, how: str = "") -> None:
+    def _refuse(self, name: str, reason: str, how: str = "", remedy: str = "") -> None:
         del self.used[name]
         self.facts[name] = {"used": False, "why": reason}
-        self.lines.append(f"[{name}] {how}is not used: {reason}: {REMEDY[name]}")
+        self.lines.append(f"[{name}] {how}is not used: {reason}: {remedy or REMEDY[name]}")
 
     def between(self, own: OwnTrajectory) -> list[Factors]:
         """Factors of ways between frames, which may join pieces, clocks being right."""
@@ -153,6 +159,8 @@ class Sensors:
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
         self._account(groups, clocks, done.state.poses[-1])
+        if "positions" in groups and "positions" in self.used:
+            self._level(done)
         return whole, done
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
@@ -226,3 +234,20 @@ class Sensors:
                 where = ", ".join(f"{v:.2f}" for v in origin)
                 text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
                 self.lines.append(f"{text}: state these with world.crs, and maps lie there")
+
+    def _level(self, done: Adjusted) -> None:
+        """Say by how much the world leans against the positions' vertical, if they show it."""
+        variances, axes = np.linalg.eigh(done.graph.covariance(done.state)[-1, 3:5, 3:5])
+        # The top of z moves by w x z. Along a straight way positions show one turn of two: the other is left as it is.
+        x, y, _ = done.state.R[-1, :, 2]
+        turns = axes.T @ [-y, x]
+        shown = np.abs(turns) > MIN_SIGMAS * np.sqrt(variances)
+        size, sigma = math.hypot(*turns[shown]), math.sqrt(variances[shown].sum())
+        if size > MIN_LEAN:
+            turn = axes[:, shown] @ turns[shown]
+            up = done.state.R[0].T @ rotation_exp([*turn, 0.0])[:, 2]
+            self.lines.append(
+                f"[positions] the world leans by {math.degrees(size):.2f} degrees (standard deviation "
+                f"{math.degrees(sigma):.2f}) against their vertical, and elevations with it: for level maps state "
+                f"world.up = [{', '.join(f'{v:.4f}' for v in up)}], which is up in the left camera of its first frame"
+            )

@@ -6,6 +6,7 @@ from test_adjust import errors, run_of
 
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.sensors import OwnTrajectory, RelativePrior, departure, resampled
 
@@ -217,6 +218,30 @@ def test_positions_say_where_the_world_lies():
     assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+@pytest.mark.parametrize("lean", [0.0, 1.0])
+def test_positions_show_that_the_world_leans(lean):
+    truth, rng = winding(), np.random.default_rng(7)
+    segments, before = run_of(truth, rng)
+    turn = RigidTransform(rotation_exp([np.deg2rad(lean), 0.0, 0.0]), np.zeros(3))
+    out = adjusted(segments, before, gnss([turn @ T for T in truth], rng, sigma=0.02))
+    said = [line for line in out.meta["warnings"] if "the world leans by" in line]
+    assert len(said) == bool(lean)
+    if said:
+        up = [float(word) for word in said[0].split("[")[-1].split("]")[0].split(",")]
+        np.testing.assert_allclose(up, (turn @ truth[0]).rotation[2], atol=0.005)
+
+
+def test_positions_are_not_compared_where_nothing_tells_of_the_vertical():
+    truth, rng = winding(), np.random.default_rng(8)
+    segments, before = run_of(truth, rng)
+    turn = RigidTransform(rotation_exp([np.pi / 2, 0.0, 0.0]), np.zeros(3))
+    given = gnss([turn @ T for T in truth], rng, sigma=0.02)
+    before.meta["verticals"] = [NO_VERTICAL]
+    said = [line for line in adjusted(segments, before, given).meta["warnings"] if "[positions]" in line]
+    assert len(said) == 1
+    assert "world.up" in said[0]
 
 
 def test_how_the_frame_of_positions_is_turned_changes_nothing():
