@@ -38,6 +38,8 @@ MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
 MIN_LEAN = math.radians(0.05)
 """Of the world against the vertical that is not worth a word: 1 mm a metre."""
+OTHER_FRAME_M = 1000.0
+"""Distance of the world's origin by positions from the stated one, from which on their frame is another one."""
 MAX_SHARED_SIGMAS = 4.0
 """Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
 REMEDY = {
@@ -65,14 +67,14 @@ class Clock(NamedTuple):
 class Sensors:
     """Other sensors of a trajectory by name; ``lines`` collects what is noticed.
 
-    ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeferenced``: the
-    world has a place on Earth. ``facts`` of each sensor.
+    ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeference``: the
+    place of the world on Earth, where it is stated. ``facts`` of each sensor.
     """
 
     used: dict[str, Sensor]
     times: Floats
     timed: bool
-    georeferenced: bool
+    georeference: Mapping[str, Any] | None
     lines: list[str] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
 
@@ -98,7 +100,7 @@ class Sensors:
             used["positions"] = PositionPrior.of(given["positions"], clocked=timed)
         if "up" in given:
             used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
-        return Sensors(used, times, timed, bool(given.get("georeferenced", False)))
+        return Sensors(used, times, timed, given.get("georeference"))
 
     def believe(self, own: OwnTrajectory, *, upright: bool) -> None:
         """Leave out the sensors that contradict the camera's own chain, and say so; ``upright``: its z is known."""
@@ -158,8 +160,9 @@ class Sensors:
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
-        self._account(groups, clocks, done.state.poses[-1])
-        if "positions" in groups and "positions" in self.used:
+        self._account(groups, clocks)
+        if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
+            self._locate(done, positions.laid)
             self._level(done)
         return whole, done
 
@@ -204,8 +207,8 @@ class Sensors:
                 clocks[name] = clock if clock.determined else clock._replace(late=0.0)
         return clocks
 
-    def _account(self, groups: Collection[str], clocks: Mapping[str, Clock], place: Floats) -> None:
-        """Facts and lines of the sensors that a piece was adjusted to; ``place`` (3, 4) is its pose in the world."""
+    def _account(self, groups: Collection[str], clocks: Mapping[str, Clock]) -> None:
+        """Facts and lines of the sensors that a piece was adjusted to."""
         for name, clock in clocks.items():
             self.facts[name] |= {
                 "late_s": clock.late,
@@ -225,15 +228,26 @@ class Sensors:
             if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
-        if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
-            there = (RigidTransform.from_matrix(place) @ positions.laid).inverse()
-            origin, ahead = there.translation, there.rotation[:, 1]
-            azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
-            self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
-            if not self.georeferenced:
-                where = ", ".join(f"{v:.2f}" for v in origin)
-                text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
-                self.lines.append(f"{text}: state these with world.crs, and maps lie there")
+
+    def _locate(self, done: Adjusted, laid: RigidTransform) -> None:
+        """Say where the world lies in the frame of positions, unless that is stated; ``laid`` as of their prior."""
+        there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ laid).inverse()
+        origin, ahead = there.translation, there.rotation[:, 1]
+        azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
+        self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
+        named = f"world.origin is [{', '.join(f'{v:.2f}' for v in origin)}] and world.azimuth_deg is {azimuth:.2f}"
+        if self.georeference is None:
+            self.lines.append(f"[positions] in their frame {named}: state these with world.crs, and maps lie there")
+            return
+        variances = np.diag(done.graph.covariance(done.state)[-1])
+        off = float(np.linalg.norm(origin - self.georeference["origin"]))
+        turn = math.radians(azimuth) - self.georeference["azimuth"]
+        turn = abs(math.remainder(turn, math.tau))
+        apart = off > MIN_SIGMAS * math.sqrt(variances[:3].sum())
+        turned = turn > max(MIN_SIGMAS * math.sqrt(variances[5]), MIN_LEAN)
+        if off < OTHER_FRAME_M and (apart or turned):
+            text = f"maps lie {off:.2f} m off at the origin and are turned by {math.degrees(turn):.2f} degrees"
+            self.lines.append(f"[positions] contradict the stated place: {text}; by them {named}: state these")
 
     def _level(self, done: Adjusted) -> None:
         """Say by how much the world leans against the positions' vertical, if they show it."""

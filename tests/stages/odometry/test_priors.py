@@ -11,7 +11,7 @@ from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.sensors import OwnTrajectory, RelativePrior, departure, resampled
 
 TIMES = 0.1 * np.arange(31)
-BASE = {"times": TIMES.tolist(), "timed": True, "georeferenced": True}
+BASE = {"times": TIMES.tolist(), "timed": True, "georeference": {"origin": [-1e6, 0.0, 0.0], "azimuth": 0.0}}
 AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 TURNED = rotation_exp([0.0, np.deg2rad(10.0), 0.0])
 
@@ -213,11 +213,20 @@ def test_positions_that_lengthen_the_cameras_ways_are_said_to(scale):
 def test_positions_say_where_the_world_lies():
     truth, rng = winding(), np.random.default_rng(6)
     segments, before = run_of(truth, rng)
-    out = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeferenced": False})
+    out = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": None})
     place = out.meta["priors"]["place"]
     assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+@pytest.mark.parametrize(("east", "turn", "named"), [(0.0, 0.0, 0), (1.0, 0.0, 1), (0.0, 1.5, 1), (5e4, 30.0, 0)])
+def test_positions_contradict_a_stated_place(east, turn, named):
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    place = {"origin": [4.5e5 + east, 5.4e6, 300.0], "azimuth": np.deg2rad(turn) - 1.0}
+    lines = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": place}).meta["warnings"]
+    assert len([line for line in lines if "contradict the stated place" in line]) == named
 
 
 @pytest.mark.parametrize("lean", [0.0, 1.0])
