@@ -110,14 +110,15 @@ class SegmentAdjustment:
 
     def observations(self, f: int) -> Observations:
         """Frame ``f`` by itself, landmarks as their disparities have them."""
-        return Observations.of(
-            self.tracks.landmarks, self.tracks.pixels[f], self.tracks.camera, self.params.pixel_sigma
-        )
+        tracks = self.tracks
+        return Observations(tracks.landmarks, tracks.pixels[f], tracks.camera, self.params.pixel_sigma)
 
     def errors(self, state: SegmentState, f: int) -> Errors:
         """Back-projection errors of frame ``f``; depths are unknowns, so landmarks have no error of their own."""
-        exact = self.observations(f)._replace(sigma=np.zeros(len(state.depth)))
-        return back_projection(exact, Pose(state.R[f], state.t[f], state.depth + state.bias))
+        exact = replace(self.tracks.landmarks, sigma=np.zeros(len(state.depth)))
+        return back_projection(
+            self.observations(f)._replace(landmarks=exact), Pose(state.R[f], state.t[f], state.depth + state.bias)
+        )
 
     def weights(self, errors: Errors, f: int) -> Floats:
         """Huber's weights (n,) of frame ``f``; 0 of what is not seen there."""
@@ -226,7 +227,7 @@ class PosedTracks(NamedTuple):
 
     def landmarks(self) -> Floats:
         """Landmarks (n, 3) in this state, m, local frame."""
-        return self.tracks.landmarks.moved(self.state.depth + self.state.bias)
+        return self.tracks.landmarks.moved(self.state.depth + self.state.bias).position
 
 
 class PoseErrors(NamedTuple):

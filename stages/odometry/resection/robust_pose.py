@@ -37,6 +37,7 @@ from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.projection import Pinhole
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
@@ -159,14 +160,14 @@ def resect(
     count = f"{where}: too few landmarks: {len(pixels)} have coordinates and were found ({landmarks.summary()})"
     enough(len(pixels), count, "set track.points higher or choose basic pairs closer")
     _not_collinear(landmarks.position, where)
-    obs = Observations.of(landmarks, pixels, camera, params.pixel_sigma)
+    obs = Observations(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]
     pose, near = _robust_start(obs, predictions, params, frame)
     pose, active = _without_inconsistent(obs, pose, near, params, where)
     errors = back_projection(obs, pose)
     _not_by_chance(errors, params, where)
     _not_collinear(landmarks.position[active], where)
-    depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
+    depth = float(np.median(obs.landmarks.position[active] @ pose.R[2] + pose.t[2]))
     normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
     measured, stated = _certainty(errors, normal, depth, params, where)
     covariance, shared = frame_errors(measured, stated, pose.R, depth)
@@ -209,8 +210,8 @@ def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % 2**31
     # The size plays no part, but must be there.
-    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(obs.camera))
-    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks, camera, options)
+    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(Pinhole.of(obs.camera)))
+    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks.position, camera, options)
     return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
 
 
@@ -246,8 +247,9 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
     A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
     landmark agrees with everything, thousands of pixels off.
     """
-    depth = obs.landmarks @ pose.R[2] + pose.t[2]
-    return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= MAX_RELATIVE_SIGMA * depth)
+    depth = obs.landmarks.position @ pose.R[2] + pose.t[2]
+    spread = obs.landmarks.sigma * np.linalg.norm(obs.landmarks.per_pixel, axis=1)
+    return np.asarray(spread <= MAX_RELATIVE_SIGMA * depth)
 
 
 def _certainty(

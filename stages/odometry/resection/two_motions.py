@@ -69,7 +69,7 @@ def moving_by_themselves(
     seen = points.known()[:, 1 : j + 1] & trusted[:, None]
     total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
     known, pixels = points.landmarks.take(use), points.tracks[use, j].astype(np.float64)
-    observed = Observations.of(known, pixels, camera, params.pixel_sigma)
+    observed = Observations(known, pixels, camera, params.pixel_sigma)
 
     def contradict(pose: Resection) -> Bools:
         errors = back_projection(observed, Pose.of(pose.T_local_left.inverse()))
