@@ -18,7 +18,8 @@ from rille.pipeline.engine.plain import some
 from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
-from rille.pipeline.report.words import metres, spans
+from rille.pipeline.report.words import spans
+from rille.stages.core.quantities import metres
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 
 Rows = list[dict[str, Any]]

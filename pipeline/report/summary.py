@@ -19,7 +19,7 @@ from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
-from rille.pipeline.report.words import metres, number, quantity
+from rille.stages.core.quantities import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses

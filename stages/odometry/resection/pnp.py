@@ -87,8 +87,11 @@ def back_projection(obs: Observations, pose: Pose) -> Errors:
     """Eq. 7 and 8 at a pose, linearised."""
     whitened, lengths = np.zeros((len(obs.pixels), 2, 8)), np.empty((len(obs.pixels), 3))
     at = obs.landmarks.moved(pose.bias)
-    arrays = (np.ascontiguousarray(a, np.float64) for a in (at.position, at.per_pixel, at.sigma, obs.pixels))
-    _linearised(_Seen(*arrays, Pinhole.of(obs.camera), obs.pixel_sigma), pose.R, pose.t, whitened, lengths)
+    position, per_pixel, sigma, pixels = (
+        np.ascontiguousarray(a, np.float64) for a in (at.position, at.per_pixel, at.sigma, obs.pixels)
+    )
+    seen = _Seen(position, per_pixel, sigma, pixels, Pinhole.of(obs.camera), obs.pixel_sigma)
+    _linearised(seen, pose.R, pose.t, whitened, lengths)
     return Errors(whitened[..., :7], whitened[..., 7], *lengths.T)
 
 
