@@ -25,9 +25,6 @@ from rille.stages.odometry.frame_screening import FrameScreeningParams
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
 
-GAP_STEPS = 2.5
-"""Median steps of time above which a step is a gap."""
-
 
 @dataclass(frozen=True)
 class InputLimit:
@@ -175,7 +172,7 @@ def judge_times(times: Sequence[float] | None) -> Finding:
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
     usual = float(np.median(steps))
-    gaps, longest = int((steps > GAP_STEPS * usual).sum()), int(np.argmax(steps))
+    gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
         words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"

@@ -45,8 +45,6 @@ from rille.stages.geometry.geometry import Rig
 
 ANGLES = 3
 
-UNLIKELY = 2.0
-"""Size of an angle, in standard deviations, from which on a wrong principal point does not explain it."""
 
 BEYOND = 1.0
 BEYOND_SHARE = 0.1
@@ -55,7 +53,6 @@ BEYOND_SHARE = 0.1
 BEYOND_LEFT = 0.03
 """Largest share of matches beyond infinity that may remain after a correction that explains the others."""
 
-ROUNDS = 3
 
 PRIOR_ROTATION_DEG, PRIOR_BASELINE_DEG = 0.05, 0.2
 """Standard deviations [degrees] of each rotation angle, and of the baseline's direction, of an intact calibration."""
@@ -186,7 +183,7 @@ class _Chooser:
 
     def decision(self) -> Decision:
         chosen: list[int] = []
-        for _ in range(ROUNDS):  # a later parameter may make an earlier one unnecessary, and the other way round
+        for _ in range(3):  # a later parameter may make an earlier one unnecessary, and the other way round
             before = sorted(chosen)
             self._add(chosen, range(ANGLES))
             self._add(chosen, range(ANGLES, RIG))
@@ -244,7 +241,7 @@ class _Chooser:
         if self.impossible or self._turned(i, chosen):
             return True
         x, covariance, _ = self._solve([*chosen, i], rival=True)
-        return abs(float(x[i])) >= UNLIKELY * math.sqrt(float(covariance[i, i]))
+        return abs(float(x[i])) >= 2.0 * math.sqrt(float(covariance[i, i]))
 
     def _turned(self, i: int, chosen: list[int]) -> bool:
         """Whether another angle of the rig has changed."""

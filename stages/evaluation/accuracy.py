@@ -30,9 +30,6 @@ from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotatio
 from rille.stages.geometry.rigid import posed, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
-MIN_MOVED_M = 1e-6
-"""Length of the true path below which a camera counts as at rest, and has no scale error."""
-
 CLAIMS = (
     ("nees", slice(0, 6), ""),
     ("nees_position", slice(0, 3), ", of positions alone"),
@@ -136,7 +133,7 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     p, q = (rigid.motion(T, slice(None, -1), slice(1, None)) for T in (P, Q))
     both = posed(p) & posed(q)
     p, q = p[both, :, 3], q[both, :, 3]
-    if len(p) < 3 or np.linalg.norm(q, axis=1).sum() < MIN_MOVED_M:
+    if len(p) < 3 or np.linalg.norm(q, axis=1).sum() < 1e-6:
         return {"scale_error": metric("fewer than three motions, or the camera did not move", "%", "")}
     square = float((q * q).sum())
     scale = float((p * q).sum()) / square

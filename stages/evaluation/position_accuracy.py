@@ -46,8 +46,6 @@ MIN_SHARE = 2 / 3
 EQUAL_ERROR = 2**0.5
 """Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
 
-SAME_TIME_S = 1e-6
-"""Difference below which two times are the same."""
 
 MAX_RANGE_SHARE = 0.5
 """Share of the searched range: where equally good offsets span more, the offset is not determined."""
@@ -58,8 +56,6 @@ MAX_TRIALS = 20000
 MAX_ERROR_SHARE = 0.5
 """Where other axes, another unit or a lever arm of the truth leave less than this share of the error, it is said."""
 
-MIN_LEVER_FRAMES = 10
-"""Frames by which a lever arm is fitted: with turn, shift and clock it has up to ten unknowns."""
 
 MIN_SWING = 0.1
 """RMS way of the antenna about the camera over its lever arm, from which on turns show it: they are 6 degrees."""
@@ -92,7 +88,7 @@ class TruePositions:
         known = (start <= moments) & (moments <= end) & (end - start <= self.max_gap)
         # At a row itself a gap beside it does not matter; and times are written with few digits: the first and the last
         # image must not fall out by a rounding.
-        known |= np.minimum(np.abs(moments - start), np.abs(moments - end)) <= SAME_TIME_S
+        known |= np.minimum(np.abs(moments - start), np.abs(moments - end)) <= 1e-6
         places = np.stack([np.interp(moments, self.times, axis) for axis in self.positions.T], axis=1)
         return np.where(known[:, None], places, np.nan)
 
@@ -244,7 +240,8 @@ def position_accuracy(
     upright : whether the world's vertical was measured; else truth with heights is fitted in space.
     """
     without = _compared(poses, truth, moments, upright)
-    if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < MIN_LEVER_FRAMES:
+    # With turn, shift and clock a lever arm has up to ten unknowns.
+    if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < 10:
         return without
     lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)

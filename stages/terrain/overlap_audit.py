@@ -23,8 +23,6 @@ Facts = Mapping[str, Any]
 
 MAX_NAMED = 3
 """Models that a warning names."""
-MAX_LISTED = 500
-"""Seams in the result, the worst first: a long sequence has tens of thousands."""
 
 
 class OverlapAuditParams(Params):
@@ -102,7 +100,7 @@ def overlap_audit_stage(params: OverlapAuditParams, seams: Sequence[Bundle[Overl
     facts: AuditFacts = {
         "models": models,
         "seam_count": len(ranked),
-        "seams": [{k: s[k] for k in kept} for s in ranked[:MAX_LISTED]],
+        "seams": [{k: s[k] for k in kept} for s in ranked[:500]],  # of tens of thousands
         "warnings": [],
     }
     if bad:

@@ -45,11 +45,6 @@ from rille.stages.odometry.resection.robust_pose import (
     whole,
 )
 
-MAX_STEPS = 20
-"""Steps of Levenberg-Marquardt, at most; about 5 suffice."""
-MIN_DISPARITY_SIGMA_PX = 1e-3
-"""Pixels: an exact disparity would have infinite information."""
-
 
 @dataclass(frozen=True)
 class SegmentTracks:
@@ -181,7 +176,8 @@ class SegmentAdjustment:
 
 def adjust(tracks: SegmentTracks, start: SegmentState, params: ResectParams) -> Minimum[SegmentState]:
     """The state of least cost; never worse than its start by the same cost."""
-    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, MAX_STEPS)
+    # About 5 steps suffice.
+    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, 20)
 
 
 class PosedTracks(NamedTuple):
@@ -203,7 +199,8 @@ class PosedTracks(NamedTuple):
         if not len(rows):
             return None
         landmarks = points.landmarks.take(rows)
-        landmarks = replace(landmarks, sigma=np.maximum(landmarks.sigma, MIN_DISPARITY_SIGMA_PX))
+        # An exact disparity would have infinite information.
+        landmarks = replace(landmarks, sigma=np.maximum(landmarks.sigma, 1e-3))
         pixels = np.swapaxes(points.tracks[rows][:, frames], 0, 1).astype(np.float64)
         T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
         state = SegmentState(

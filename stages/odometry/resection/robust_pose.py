@@ -54,18 +54,12 @@ from rille.stages.odometry.resection.pnp import (
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-MAX_BLOCKS = 6
-"""Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
-MIN_PER_BLOCK = 6
-"""Mean number of landmarks in a block, at least."""
 MAX_STEPS = 50
 """Steps of Levenberg-Marquardt, at most; about 10 suffice."""
 SEED = 1999 * 100_003
 """Seed of the random samples, to which the frame's number is added."""
 SHARED_SOURCES = 7
 """Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
-REMOVED_SHARE = 8
-"""Per iteration, the worst ceil(n / 8) of n landmarks above the threshold are removed; then the pose is adjusted."""
 SEARCHED_PX = 9.0
 """Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
 THRESHOLD_SHARES = (0.25, 0.5, 1.0)
@@ -238,7 +232,7 @@ def _without_inconsistent(
             return pose, active
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
-        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
+        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / 8)]] = False
 
 
 def _first_order(obs: Observations, pose: Pose) -> Bools:
@@ -307,7 +301,8 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     pose less well than as many independent ones. ``white`` (n, 2): whitened errors after adjustment, at ``pixels``
     (n, 2), with ``weight`` (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
     """
-    side = min(MAX_BLOCKS, int(math.sqrt(len(pixels) / MIN_PER_BLOCK)))
+    # At most 6 x 6 blocks, of six landmarks on average at least.
+    side = min(6, int(math.sqrt(len(pixels) / 6)))
     if side < 3:
         return 1.0
     col = np.clip(pixels[:, 0] * side / camera.width, 0, side - 1).astype(np.intp)
