@@ -137,7 +137,8 @@ class Sequence:
     truth : T_truth_left of each frame, in any world frame, metres; None where the truth has a gap.
     truth_positions : truth that is positions alone, where ``truth`` is None.
     truth_source : what the truth is, in words.
-    truth_sigma : standard deviations of the true positions (m) and rotations (rad), about each axis; 0: not stated.
+    truth_sigma_m, truth_sigma_rad : standard deviations of the true positions, and rotations about each axis; 0: not
+        stated.
     truth_mount : T_body_left, by which the poses of the truth's file were multiplied; None: they are the camera's.
     up : direction of "up" in each left camera frame (attitude); None where it is not known.
     attitude : R_reference_left of each frame from a sensor (gyroscope, compass); the reference is any inertial frame,
@@ -174,7 +175,8 @@ class Sequence:
     truth: tuple[RigidTransform | None, ...] | None = None
     truth_positions: Positions | None = None
     truth_source: str = ""
-    truth_sigma: tuple[float, float] = (0.0, 0.0)
+    truth_sigma_m: float = 0.0
+    truth_sigma_rad: float = 0.0
     truth_mount: RigidTransform | None = None
     up: tuple[tuple[float, float, float] | None, ...] | None = None
     attitude: tuple[Rows | None, ...] | None = None

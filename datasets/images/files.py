@@ -46,8 +46,6 @@ EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).bytesw
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
 
-TAIL = 4096
-"""Bytes in which a file ends: its end marker may be followed by padding."""
 
 ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
 """What nothing else ends a file with, by its first two bytes."""
@@ -272,7 +270,8 @@ def _header(path: Path) -> Header:
     with open_regular(path, "image", MOST_BYTES) as file:
         start, header = file.peek(2)[:2], read_header(file)
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - TAIL))
+        # Padding may follow the end marker.
+        file.seek(max(0, size - 4096))
         bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
         if header is not None and size >= bands * math.prod(header) // 8 and ENDS.get(start, b"") in file.read():
             return header

@@ -105,14 +105,15 @@ def mosaic(image: AnyArray) -> bool:
     cut = image[: rows * 2 * BLOCK, : cols * 2 * BLOCK].astype(np.float32)
     cells = cut.reshape(rows, BLOCK, 2, cols, BLOCK, 2).transpose(2, 5, 0, 3, 1, 4).reshape(4, rows, cols, -1)
     a, b, c, d = cells
-    phases = np.stack([a + d - b - c, a + b - c - d, a + c - b - d]) / 2
-    departs = np.abs(phases.mean(-1))
-    # By a share of the grey value, and by standard deviations.
-    greens, rows_differ, columns_differ = (departs > 0.03 * cells.mean((0, 3))) & (
-        departs > 6.0 * phases.std(-1) / BLOCK
-    )
+
+    def differ(halves: AnyArray) -> AnyArray:
+        """Whether two halves of a cell do: by a share of the grey value, and by standard deviations."""
+        departs = np.abs(halves.mean(-1)) / 2
+        return np.asarray((departs > 0.03 * cells.mean((0, 3))) & (departs > 3.0 * halves.std(-1) / BLOCK))
+
     # In ordinary images at most 0.01 of the blocks show a mosaic, in mosaics at least 0.87.
-    return bool((greens | (rows_differ & columns_differ)).mean() > 0.4)
+    diagonals, rows_differ, columns_differ = differ(a + d - b - c), differ(a + b - c - d), differ(a + c - b - d)
+    return bool((diagonals | (rows_differ & columns_differ)).mean() > 0.4)
 
 
 def _orientations(left: set[int], right: set[int]) -> list[str]:

@@ -240,8 +240,8 @@ class MotionReader:
             text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
         mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        sigma = (section.sigma_m or 0.0, math.radians(section.sigma_deg or 0.0))
-        self.state(truth=self.poses(section, "truth"), truth_mount=mount, truth_sigma=sigma)
+        self.state(truth=self.poses(section, "truth"), truth_mount=mount)
+        self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
     def odometry(self, section: Odometry) -> None:
         """Dead reckoning, which is a measurement where it says how good it is."""

@@ -15,16 +15,12 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.geometry.geometry import rotation_exp
 
-SPEED_M_S = 0.05  # m/s; with it, bumps become accelerations
-ODOMETRY_SIGMA_SHARE = 0.01  # relative, of distances and turns by the wheels, as of their radius
-ATTITUDE_SIGMA_DEG = 0.2  # of the inclinometer about each axis
-ACCELERATION_SIGMA_M_S2 = 0.05  # m/s2, of the accelerometer
-
 
 def _peaks(z: Floats, wheels: Floats) -> Floats:
     """Vertical acceleration (position,), m/s2, of the body at its driving speed; none where it turns on the spot."""
     out = np.zeros(len(z))
-    seconds = np.hypot(*np.diff(wheels[:, :2], axis=0).T) / SPEED_M_S
+    # The vehicle drives at 0.05 m/s.
+    seconds = np.hypot(*np.diff(wheels[:, :2], axis=0).T) / 0.05
     rolls = (seconds[:-1] > 0) & (seconds[1:] > 0)
     a, b, rise = seconds[:-1][rolls], seconds[1:][rolls], np.diff(z)
     out[1:-1][rolls] = np.abs((rise[1:][rolls] / b - rise[:-1][rolls] / a) / (0.5 * (a + b)))
@@ -44,13 +40,16 @@ def sense_stage(params: RoverParams, drive: Bundle[DrivenFacts], *, leg: int) ->
     rng = np.random.default_rng([params.seed, 71, 1 + leg])
     at = np.asarray(drive["frame_at"])
     wheels, poses = np.asarray(drive["wheels"])[at], np.asarray(drive["poses"])
-    # One error for the whole leg: it does not average out over the leg's images.
-    odometry = wheels * (1.0 + ODOMETRY_SIGMA_SHARE * float(rng.standard_normal()))
-    sigma = math.radians(ATTITUDE_SIGMA_DEG)
+    # One error for the whole leg: it does not average out over the leg's images. Distances and turns are wrong by one
+    # factor, as the wheels' radius is.
+    odometry = wheels * (1.0 + 0.01 * float(rng.standard_normal()))
+    # Of the inclinometer, about each axis.
+    sigma = math.radians(0.2)
     # The third row of R_bed_left is the bed's z axis, in axes of the camera.
     up = np.stack([rotation_exp(sigma * rng.standard_normal(3)) @ pose[2, :3] for pose in poses])
     peak = _peaks(np.asarray(drive["trail"])[:, 2, 3], np.asarray(drive["wheels"]))
     acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]
-    noise = ACCELERATION_SIGMA_M_S2 * rng.standard_normal(len(at))
+    # m/s2, of the accelerometer.
+    noise = 0.05 * rng.standard_normal(len(at))
     arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
     return Bundle(arrays, {"leg": leg, "up": up.tolist(), "odometry": odometry.tolist()})

@@ -24,7 +24,6 @@ HURST = 0.85
 
 MIN_ROCK_M, MAX_ROCK_M = 0.004, 0.11
 MIN_CRATER_M, MAX_CRATER_M = 0.025, 0.35
-SUN_DIAMETER_DEG = 1.5  # of a studio lamp some metres away, with soft edges of its shadows
 NO_CEILING_M = -1e9  # m: the ceiling of the shade where there is none
 
 
@@ -227,8 +226,9 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     points = 16
     count = np.zeros(height.shape, np.uint8)
     for k in range(points):
-        # Square roots and the golden angle (Vogel's spiral) spread the points evenly over the disc.
-        radius, angle = 0.5 * SUN_DIAMETER_DEG * np.sqrt((k + 0.5) / points), k * 2.39996323
+        # Square roots and the golden angle (Vogel's spiral) spread the points evenly over the disc, that of
+        # a studio lamp, 1.5 degrees wide: shadows have soft edges.
+        radius, angle = 0.75 * np.sqrt((k + 0.5) / points), k * 2.39996323
         # Off the horizon and the zenith: there tan() is 0, or has no end.
         elevation = np.deg2rad(np.clip(p.sun_elevation_deg + radius * np.sin(angle), 0.5, 89.5))
         # An angle on the sky spans more azimuth the higher it stands.

@@ -50,8 +50,6 @@ KINDS = ("dask", "inline")
 WATCH_SECONDS = 0.2
 """Time until something else than an end of a task is looked after."""
 
-LOOK_SECONDS = 2.0
-"""Time between looks at the scheduler."""
 
 CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
 """Time within which a scheduler must have answered, at first and later."""
@@ -334,7 +332,7 @@ class Dask:
         while not ended:
             # Not for ever: a call whose worker died and a scheduler that is lost send no event.
             ended = self._events_of(WATCH_SECONDS)
-            due = time.monotonic() - self._looked > LOOK_SECONDS
+            due = time.monotonic() - self._looked > 2.0
             if due:
                 self._look()
             if due or not ended:

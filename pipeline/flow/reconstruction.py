@@ -99,8 +99,6 @@ from rille.stages.terrain.tile_index import tile_index_stage
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
-RIG_PAIRS = 200
-"""Pairs that one rig is found from: its time grows with their number, its errors are systematic long before."""
 
 SEAMS = 24
 """Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
@@ -108,8 +106,6 @@ SEAMS = 24
 SUSPECTS = 12
 """Pairs of doubtful rows that are compared with right images of other times at once."""
 
-TABLE_FRAMES = 100
-"""Motions that one table of steps holds."""
 
 PLACES_FRAMES = 500
 """Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
@@ -242,7 +238,7 @@ def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     made: dict[tuple[int, ...], list[Handle[StepTableFacts]]] = make.made.setdefault("steps", {})
     if tuple(frames) not in made:
         taken = "step_table/bridged" if made else "step_table"
-        parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // TABLE_FRAMES)]
+        parts = [list(part) for _, part in groupby(pairwise(frames), lambda step: step[0] // 100)]
         made[tuple(frames)] = [
             make.node(step_table_stage, f"{taken}/{part[0][0]}", motions=[make.motion(*step) for step in part])
             for part in parts
@@ -314,7 +310,8 @@ def simultaneous(
         yield Complete(("motion", "step_table"))
         chosen = yield from done(p.keyframes)
         basic = [chain[i] for i in chosen.meta["basic"]]
-        pooled = mode != "per_pair" and make.rig(spread(basic, RIG_PAIRS), which)
+        # The rig's time grows with the pairs; of 200 its errors are systematic.
+        pooled = mode != "per_pair" and make.rig(spread(basic, 200), which)
         rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
         p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
         judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))

@@ -18,7 +18,8 @@ from rille.pipeline.engine.plain import some
 from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
-from rille.pipeline.report.words import metres, spans
+from rille.pipeline.report.words import spans
+from rille.stages.core.quantities import metres
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 
 Rows = list[dict[str, Any]]
@@ -29,9 +30,6 @@ HARMLESS = ("no path", "crosscheck")
 
 MIN_OFF_MAP = 0.1
 """Share of the matched pixels from which on it is said that limits keep them off the map."""
-
-MIN_MOVING = 0.02
-"""Share of an image that moves by itself from which on that is said; errors of displacements come to less."""
 
 
 def is_complete(missing: Items) -> bool:
@@ -239,7 +237,8 @@ def coverage(view: RunView) -> list[str]:
 def moved(view: RunView) -> list[str]:
     """What moved by itself, in one line for the run."""
     shares = {pair: float(facts_of(view, one).get("share", 0.0)) for pair, one in view.products.moving.items()}
-    pairs = [pair for pair, share in shares.items() if share >= MIN_MOVING]
+    # Errors of displacements come to less.
+    pairs = [pair for pair, share in shares.items() if share >= 0.02]
     if not pairs:
         return []
     most = max(pairs, key=lambda pair: shares[pair])

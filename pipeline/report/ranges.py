@@ -12,17 +12,14 @@ from rille.stages.numeric.robust import mad_sigma
 
 Image = NDArray[Any]
 
-FEW = 100
-"""Values below which a sample tells little of a median."""
-
 
 def sample(values: Image) -> Image:
     """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
     step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
     part = values[::step, ::step] if step > 1 else values
     finite = part[np.isfinite(part)]
-    # Where little is known the grid may miss most of it: then every cell is looked at.
-    return finite if finite.size >= FEW or step == 1 else values[np.isfinite(values)]
+    # Where little is known the grid may miss most of it, and few values tell little of a median: all are looked at.
+    return finite if finite.size >= 100 or step == 1 else values[np.isfinite(values)]
 
 
 def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:

@@ -18,8 +18,8 @@ from rille.pipeline.export import artifacts
 from rille.pipeline.report import canvas, gather, ranges
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
-from rille.pipeline.report.words import metres
 from rille.stages.core.arrays import Floats
+from rille.stages.core.quantities import metres
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import grey_bytes

@@ -19,16 +19,13 @@ from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
-from rille.pipeline.report.words import metres, number, quantity
+from rille.stages.core.quantities import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.reference import seen_up
-
-REPORT_FORMAT = 2
-"""Raised when the meaning of a key of report.json changes."""
 
 
 def collect(view: RunView) -> dict[str, Any]:
@@ -72,7 +69,7 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     how = "wall clock, without writing the page; what is cached costs no time"
     clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {
-        "format": REPORT_FORMAT,
+        "format": 2,  # raised when the meaning of a key changes
         "run": view.run_id,
         "started": view.started,
         "command": view.command,
@@ -144,13 +141,10 @@ def given_numbers(view: RunView) -> list[str]:
     return [line + "."]
 
 
-MAX_COMMON_PERCENT = 50.0
-"""RMS disagreement of two trajectories [per cent of the length] from which on they have nothing in common."""
-
-
 def _unlike(figures: Mapping[str, Any]) -> list[str]:
     """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
-    if (_value(figures, "agreement_share") or 0.0) <= MAX_COMMON_PERCENT:
+    # Per cent of the length; beyond, the trajectories have nothing in common.
+    if (_value(figures, "agreement_share") or 0.0) <= 50.0:
         return []
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
     return [f"trajectory and COLMAP have nothing in common: {rmse} RMS over {length}; one is wrong"]

@@ -17,8 +17,6 @@ from rille.stages.imaging import levels
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
-MAX_BLANK_SHARE = 0.5
-"""Share of pixels without texture from which on that is said, however well the others match."""
 
 WHY_NOT = (
     (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
@@ -69,7 +67,8 @@ def _unmatched(result: Any) -> str:
 def _without_texture(result: Any) -> str:
     share = float(has(result.validity, Validity.NO_TEXTURE).mean())
     text = f"{100 * share:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
-    return warning("RIL-701", text) if share > MAX_BLANK_SHARE else ""
+    # Half of the image is worth a word, however well the rest matches.
+    return warning("RIL-701", text) if share > 0.5 else ""
 
 
 def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:

@@ -28,9 +28,6 @@ Look = Mapping[str, Any]
 MAX_SPEED = 60.0
 """m/s between most records of a sensor, which no vehicle with stereo cameras drives."""
 
-GAP_STEPS = 2.5
-"""Median steps of time above which a step is a gap."""
-
 
 @dataclass(frozen=True)
 class InputLimit:
@@ -189,7 +186,7 @@ def judge_times(times: Sequence[float] | None) -> Finding:
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
     usual = float(np.median(steps))
-    gaps, longest = int((steps > GAP_STEPS * usual).sum()), int(np.argmax(steps))
+    gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
         words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"

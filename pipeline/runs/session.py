@@ -8,7 +8,6 @@ complete or whose holes are named in its report.
 from __future__ import annotations
 
 import hashlib
-import resource
 import sys
 import uuid
 from collections.abc import Callable, Iterator
@@ -30,6 +29,7 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
 from rille.pipeline.export.view import UNSTATED, RunView
@@ -44,10 +44,6 @@ from rille.stages.core.errors import ConfigError, RilleError
 
 if TYPE_CHECKING:
     from rille.pipeline.runs import run_files
-
-
-MIN_OPEN_FILES, MAX_OPEN_FILES = 128, 8192
-"""Open files that a run of few workers needs (80 were enough for two), and that are asked for at most."""
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -122,7 +118,7 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
         refuse_unknown("--force", options.force, configuration.stage_names(), "stage")
     check(options.executor, options.jobs)
     memory_limit(options)
-    _permit_open_files()
+    permit_open_files()
     settled = settings(sequence, options)
     sequence, driven = settled.sequence, settled.sequence.simulation is not None
     who = "a drive" if driven else f"a reconstruction of {sequence.name}"
@@ -141,23 +137,6 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
 def memory_limit(options: Work) -> int | None:
     """Bytes that a run may use in total; None: what is free."""
     return None if options.memory_limit is None else memory.parse(options.memory_limit)
-
-
-def _permit_open_files() -> None:
-    """Let this process open as many files as the system permits: pipes of workers, libraries, artifacts.
-
-    Raises
-    ------
-    ConfigError
-        They are too few.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
-    if most < MIN_OPEN_FILES:
-        text = f"the system permits {hard} open files, a run needs {MIN_OPEN_FILES}"
-        raise ConfigError("RIL-584", text, remedy="raise the limit: ulimit -n 1024")
-    if 0 <= soft < most:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 @dataclass(frozen=True)

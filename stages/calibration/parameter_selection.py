@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -45,8 +45,6 @@ from rille.stages.geometry.geometry import Rig
 
 ANGLES = 3
 
-UNLIKELY = 2.0
-"""Size of an angle, in standard deviations, from which on a wrong principal point does not explain it."""
 
 BEYOND = 1.0
 BEYOND_SHARE = 0.1
@@ -55,7 +53,6 @@ BEYOND_SHARE = 0.1
 BEYOND_LEFT = 0.03
 """Largest share of matches beyond infinity that may remain after a correction that explains the others."""
 
-ROUNDS = 3
 
 PRIOR_ROTATION_DEG, PRIOR_BASELINE_DEG = 0.05, 0.2
 """Standard deviations [degrees] of each rotation angle, and of the baseline's direction, of an intact calibration."""
@@ -157,6 +154,21 @@ def decide(rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> Dec
     return _Chooser(rig, pairs, params).decision()
 
 
+class _Asked(NamedTuple):
+    """What the images ask of a parameter that is freed beside the chosen ones, cameras as given.
+
+    ``value``, ``sigma``: radians; ``rows``, ``depth``: what that does to rows, pixels RMS, and to depth, relative.
+    """
+
+    value: float
+    sigma: float
+    rows: float
+    depth: float
+
+    def __str__(self) -> str:
+        return f"{math.degrees(self.value):+.3f} +- {math.degrees(self.sigma):.3f} degrees"
+
+
 class _Chooser:
     """Chooses on the quadratic that a fit with everything free leaves, then fits once more with the chosen."""
 
@@ -171,7 +183,7 @@ class _Chooser:
 
     def decision(self) -> Decision:
         chosen: list[int] = []
-        for _ in range(ROUNDS):  # a later parameter may make an earlier one unnecessary, and the other way round
+        for _ in range(3):  # a later parameter may make an earlier one unnecessary, and the other way round
             before = sorted(chosen)
             self._add(chosen, range(ANGLES))
             self._add(chosen, range(ANGLES, RIG))
@@ -229,7 +241,7 @@ class _Chooser:
         if self.impossible or self._turned(i, chosen):
             return True
         x, covariance, _ = self._solve([*chosen, i], rival=True)
-        return abs(float(x[i])) >= UNLIKELY * math.sqrt(float(covariance[i, i]))
+        return abs(float(x[i])) >= 2.0 * math.sqrt(float(covariance[i, i]))
 
     def _turned(self, i: int, chosen: list[int]) -> bool:
         """Whether another angle of the rig has changed."""
@@ -243,60 +255,57 @@ class _Chooser:
         free = np.isin(np.arange(RIG), [*chosen, i])
         return impossible_share(corrected(self.rig, np.where(free, x[:RIG], 0.0)), self.pairs, self.all) < BEYOND_LEFT
 
-    def _estimate(self, i: int, chosen: list[int]) -> tuple[float, float]:
-        """Value and sigma of a parameter if it were free with the chosen ones, cameras as given."""
+    def _asked(self, i: int, chosen: list[int]) -> _Asked:
         x, covariance, _ = self._solve([*chosen, i], rival=False)
-        return float(x[i]), math.sqrt(float(covariance[i, i]))
+        value = float(x[i])
+        return _Asked(value, math.sqrt(float(covariance[i, i])), *self._moves(value * np.eye(RIG)[i]))
 
     def _refusal(self, i: int, chosen: list[int]) -> str | None:
         """Why a parameter is held; None where it is to be freed."""
-        p = self.params
-        value, sigma = self._estimate(i, chosen)
-        rows, depth = self._moves(value * np.eye(RIG)[i])
-        found = f"{math.degrees(value):+.3f} +- {math.degrees(sigma):.3f} degrees"
-        error = self._depth_error(i, chosen)
+        asked, error = self._asked(i, chosen), self._depth_error(i, chosen)
         if error > MAX_DEPTH_ERROR and not self._infinity(i, chosen):
             off = self.priors.principal[dict(PARTNERS).get(i, 0)]
             return (
                 f"not observed: a principal point that is {off:.1f} px off looks like it, so that "
-                f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {found}, "
-                f"which is {100 * depth:.1f} % of depth"
+                f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {asked}, "
+                f"which is {100 * asked.depth:.1f} % of depth"
             )
         # Of a rig that was turned nothing says that its other angles are those of the calibration.
-        turned, contradicted = i < ANGLES and self._turned(i, chosen), abs(value) >= p.significance * sigma
-        if not contradicted and not (turned and abs(value) >= sigma):
-            return f"not contradicted: the images say {found}"
+        turned = i < ANGLES and self._turned(i, chosen)
+        contradicted = abs(asked.value) >= self.params.significance * asked.sigma
+        if not contradicted and not (turned and abs(asked.value) >= asked.sigma):
+            return f"not contradicted: the images say {asked}"
         if not self._knocked(i, chosen):
             return (
                 f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
-                f"say {found}, which is {100 * depth:.1f} % of depth"
+                f"say {asked}, which is {100 * asked.depth:.1f} % of depth"
             )
         # Held, a small turn that is certain would pass into the other angles.
-        if rows < p.least_rows and depth < MIN_DEPTH_CHANGE and not (turned and contradicted):
-            return f"not worth it: the images say {found}, which moves rows by {rows:.2f} px, depth by {depth:.2%}"
+        small = asked.rows < self.params.least_rows and asked.depth < MIN_DEPTH_CHANGE
+        if small and not (turned and contradicted):
+            moves = f"rows by {asked.rows:.2f} px, depth by {asked.depth:.2%}"
+            return f"not worth it: the images say {asked}, which moves {moves}"
         return None
 
     def _held(self, chosen: list[int]) -> Floats:
         """Standard deviations (5,) of the held parameters, radians: their prior, or less if the images show less."""
         # Root of value squared and sigma squared: the images show how far it may be out, their own error included.
-        shown = [math.hypot(*self._estimate(i, chosen)) for i in range(RIG)]
-        return np.minimum(self.priors.held(), shown)
+        shown = [self._asked(i, chosen) for i in range(RIG)]
+        return np.minimum(self.priors.held(), [math.hypot(one.value, one.sigma) for one in shown])
 
     def _parameter(self, i: int, chosen: list[int], fit: OrientationFit) -> Parameter:
         others = [k for k in chosen if k != i]
-        observed = self._depth_error(i, others) <= MAX_DEPTH_ERROR or i in chosen
+        asked, observed = self._asked(i, others), self._depth_error(i, others) <= MAX_DEPTH_ERROR or i in chosen
         if i not in chosen:
-            value, sigma = self._estimate(i, chosen)
             why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
-            return Parameter(NAMES[i], 0.0, value, sigma, observed, False, why)
+            return Parameter(NAMES[i], 0.0, asked.value, asked.sigma, observed, False, why)
         free = [k in chosen for k in range(RIG)]
         sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self._held(chosen))[i, i]))
         value = float(fit.x[i])
-        asked, certain = self._estimate(i, others)
         rows, depth = self._moves(value * np.eye(RIG)[i])
         why = (
-            f"contradicted: {abs(asked) / certain:.0f} times the images' own error, without that of what is held; it "
-            f"moves rows by {rows:.2f} px, depth by {depth:.2%}"
+            f"contradicted: {abs(asked.value) / asked.sigma:.0f} times the images' own error, without that of what is "
+            f"held; it moves rows by {rows:.2f} px, depth by {depth:.2%}"
         )
         return Parameter(NAMES[i], value, value, sigma, observed, True, why)
 

@@ -48,19 +48,11 @@ NO_SMOOTH_PX = 3e-3
 """RMS [pixels] of a smooth error that is held at none."""
 
 MIN_MATCHES = 50
-MIN_NOISE_PX = 0.02
-"""Smallest standard deviation [pixels] of a match."""
 
 BLOCKS = 6
 """Blocks along either side of the image whose means show how far errors of neighbours go together."""
 MIN_MATCHES_OF_BLOCK = 5
 """Fewest matches of a block that have a mean, or a median, to speak of."""
-
-MAX_ITERATIONS = 30
-MAX_LINEAR_STEP_RAD = 1e-3
-"""Change [rad] of the corrections up to which the derivatives are kept; the neglected part is below 0.001 pixels."""
-CONVERGED_SHARE = 1e-2
-"""Step, as a share of a parameter's standard deviation, below which the adjustment has converged."""
 
 
 @dataclass(frozen=True)
@@ -182,9 +174,10 @@ def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Prior
 def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> OrientationFit:
     """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
-    for _ in range(MAX_ITERATIONS):
-        # All pairs are linearised about the same x: look at the first.
-        if np.abs(x - linear[0].about)[:RIG].max() > MAX_LINEAR_STEP_RAD:
+    for _ in range(30):
+        # All pairs are linearised about the same x: look at the first. Within a milliradian
+        # the derivatives neglect less than 0.001 pixels.
+        if np.abs(x - linear[0].about)[:RIG].max() > 1e-3:
             linear = linearised(rig, pairs, x)
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
         scales = [p.noise for p in parts]
@@ -192,7 +185,8 @@ def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> Orientation
         pull = np.sum([p.pull for p in parts], axis=0)
         covariance, last = np.linalg.inv(normal + prior), x
         x = covariance @ pull
-        if bool(np.all(np.abs(x - last)[:RIG] < CONVERGED_SHARE * np.sqrt(np.diag(covariance)[:RIG]))):
+        # Converged: the steps are below a hundredth of the standard deviations.
+        if bool(np.all(np.abs(x - last)[:RIG] < 1e-2 * np.sqrt(np.diag(covariance)[:RIG]))):
             break
     return OrientationFit(x, normal, pull, tuple(scales), tuple(p.weights for p in parts))
 
@@ -244,7 +238,7 @@ def _pair(linear: Linear, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
     rest = linear.constant + linear.design @ x
     # At most the last scale: weights only narrow, so that the fit cannot swing between two sets of inliers.
-    noise = max(MIN_NOISE_PX, min(last, mad_sigma(rest, 0.0)))
+    noise = max(0.02, min(last, mad_sigma(rest, 0.0)))
     weights = np.asarray(bisquare(rest / (TUKEY_BISQUARE * noise)), dtype=np.float64)
     # Errors of neighbours go together: means of blocks scatter by more than the matches in them explain.
     number = np.bincount(linear.block, weights, BLOCKS**2)

@@ -8,15 +8,12 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.sides import exchanged
 from rille.stages.imaging.features import matched_points
 
-LEAST = 50
-"""Matches, below which nothing is said."""
-
 
 @stage("swap_check")
 def swap_check_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int, rig: Rig) -> Bundle[SwapFacts]:
     """Whether left and right of a pair are exchanged, by their features."""
     a, b = matched_points(left, right)
     facts: SwapFacts = {"frame": frame, "matches": len(a), "swapped": False}
-    if len(a) >= LEAST:
+    if len(a) >= 50:
         facts["swapped"], facts["as_given"], facts["exchanged"] = exchanged(rig, a, b)
     return Bundle({}, facts)

@@ -18,12 +18,6 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
 
-MAX_DISTANCE_SHARE = 0.1
-"""Share of the right image's height that a match may depart from its line: what departs more is mismatched."""
-
-MIN_MATCHES = 40
-"""Matches, below which a pair says nothing."""
-
 MAX_SPREAD_SHARE = 0.5
 """Another right image explains the rows where their spread is below this share of the spread as named."""
 
@@ -37,9 +31,9 @@ def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
     The median is that of a camera that is turned a little, which no shift in time explains.
     """
     apart, _ = distances(rig, np.zeros(5), *matched_points(left, right))
-    # Before the spread is taken: far mismatches would hide what a shift does to the others.
-    apart = apart[np.abs(apart) < MAX_DISTANCE_SHARE * rig.right.height]
-    return np.asarray(apart - np.median(apart)) if len(apart) >= MIN_MATCHES else None
+    # Before the spread is taken: far mismatches (a tenth of the image) would hide what a shift does to the others.
+    apart = apart[np.abs(apart) < 0.1 * rig.right.height]
+    return np.asarray(apart - np.median(apart)) if len(apart) >= 40 else None
 
 
 def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> SynchronyFacts:

@@ -51,9 +51,6 @@ MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
 )
 
-SWAPPED = 0.5
-"""Share of the baseline by which a right camera may stand to the left: beyond, the sides are swapped."""
-
 
 @dataclass(frozen=True)
 class BoardView:
@@ -151,7 +148,7 @@ def check_sides(rig: RigCalibration) -> None:
         text = f"both cameras stand in one place: the baseline is {rig.values['baseline']:.2g} m"
         raise InputError("RIL-313", text, remedy="give images of two cameras: are left and right those of one?")
     centre = rig.T_right_left.inverse().translation
-    if centre[0] < -SWAPPED * float(np.linalg.norm(centre)):
+    if centre[0] < -0.5 * float(np.linalg.norm(centre)):
         text = f"the right camera stands {-centre[0]:.4g} m to the left of the left one"
         raise InputError("RIL-310", text, remedy="swap the two sets of images")
 

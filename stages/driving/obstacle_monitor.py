@@ -33,10 +33,6 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.vehicle import Vehicle
 
-REACH_WHEELS = 10.0
-"""Distance ahead of the vehicle's centre that is watched [wheel diameters]."""
-SIDE_MARGIN_WHEELS = 0.5
-"""Distance to either side of the wheels that is watched [wheel diameters]."""
 MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
 LEVEL = 1
@@ -127,10 +123,9 @@ def look(
     T_now = view.now.inverse()
     T_vehicle_local = T_vehicle_left @ T_now
     ahead = T_vehicle_local.apply(surface.points)
-    wide = 0.5 * vehicle.track + SIDE_MARGIN_WHEELS * wheel
-    near = (
-        (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= REACH_WHEELS * wheel)
-    )
+    # Ten wheel diameters ahead of the centre are watched, and half of one beside the wheels.
+    wide = 0.5 * vehicle.track + 0.5 * wheel
+    near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= 10.0 * wheel)
     pixel, ground, first = _seen(view, surface.points[near], camera)
     maps = view.column, view.row
     displacement = np.stack([a[pixel[:, 1], pixel[:, 0]].astype(np.float64) for a in maps], axis=1)

@@ -31,9 +31,6 @@ from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotatio
 from rille.stages.geometry.rigid import posed, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
-MIN_MOVED_M = 1e-6
-"""Length of the true path below which a camera counts as at rest, and has no scale error."""
-
 CLAIMS = (
     ("nees", slice(0, 6), ""),
     ("nees_position", slice(0, 3), ", of positions alone"),
@@ -43,7 +40,11 @@ CLAIMS = (
 
 
 def trajectory_accuracy(
-    estimate: Floats, truth: Floats, covariance: Floats | None = None, sigma: Sequence[float] = (0.0, 0.0)
+    estimate: Floats,
+    truth: Floats,
+    covariance: Floats | None = None,
+    sigma_m: float = 0.0,
+    sigma_rad: float = 0.0,
 ) -> tuple[dict[str, Floats], dict[str, Metric]]:
     """Compare an estimated trajectory with the true one.
 
@@ -53,7 +54,7 @@ def trajectory_accuracy(
     truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
     covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see
     :mod:`rille.stages.odometry.resection.resect`.
-    sigma : standard deviations of the true positions (m) and of the true rotations (rad), about each axis.
+    sigma_m, sigma_rad : standard deviations of the true positions, and of the true rotations about each axis.
 
     Returns
     -------
@@ -76,9 +77,9 @@ def trajectory_accuracy(
         figures["drift"] = metric("fewer than two frames have a pose and truth", "%", "")
     if covariance is not None and len(judged) > 1:
         how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
-        if any(sigma):
-            how += f"; with {sigma[0]:g} m and {math.degrees(sigma[1]):g} degrees of the truth itself"
-        total = covariance + _truth_covariance(estimate[:, :, 3] - estimate[start, :, 3], sigma)
+        if sigma_m or sigma_rad:
+            how += f"; with {sigma_m:g} m and {math.degrees(sigma_rad):g} degrees of the truth itself"
+        total = covariance + _truth_covariance(estimate[:, :, 3] - estimate[start, :, 3], sigma_m, sigma_rad)
         values = nees(estimate, aligned, total)
         figures |= {name: metric(values[name], "", how + whose) for name, _, whose in CLAIMS}
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
@@ -133,7 +134,7 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     p, q = (rigid.motion(T, slice(None, -1), slice(1, None)) for T in (P, Q))
     both = posed(p) & posed(q)
     p, q = p[both, :, 3], q[both, :, 3]
-    if len(p) < 3 or np.linalg.norm(q, axis=1).sum() < MIN_MOVED_M:
+    if len(p) < 3 or np.linalg.norm(q, axis=1).sum() < 1e-6:
         return {"scale_error": metric("fewer than three motions, or the camera did not move", "%", "")}
     square = float((q * q).sum())
     scale = float((p * q).sum()) / square
@@ -145,13 +146,13 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     return {"scale_error": metric(100.0 * (scale - 1.0), "%", how)}
 
 
-def _truth_covariance(away: Floats, sigma: Sequence[float]) -> Floats:
+def _truth_covariance(away: Floats, sigma_m: float, sigma_rad: float) -> Floats:
     """Covariances (n, 6, 6) of (position m, rotation rad) of true poses that lie ``away`` (n, 3), m, from the first.
 
     The first was made equal to the estimate. Each has errors of its own; those of the first one move all others, and
     turn them about it.
     """
-    own, moved = np.diag(np.repeat(np.square(sigma), 3)), np.tile(np.eye(6), (len(away), 1, 1))
+    own, moved = np.diag(np.repeat(np.square([sigma_m, sigma_rad]), 3)), np.tile(np.eye(6), (len(away), 1, 1))
     moved[:, :3, 3:] = -cross_matrix(away)
     return own + moved @ own @ np.swapaxes(moved, 1, 2)
 
@@ -198,14 +199,15 @@ def accuracy_stage(
     frames: list[int],
     truth: Sequence[Sequence[float] | None],
     mount: RigidTransform | None = None,
-    sigma: Sequence[float] = (0.0, 0.0),
+    sigma_m: float = 0.0,
+    sigma_rad: float = 0.0,
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES."""
     given, true = trajectory.meta["frames"], pose_rows(truth)
     estimate, claimed = rigid.by_frame(world_poses(trajectory), given, frames), None
     if "covariance" in trajectory.arrays:
         claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, frames)
-    arrays, figures = trajectory_accuracy(estimate, true, claimed, sigma)
+    arrays, figures = trajectory_accuracy(estimate, true, claimed, sigma_m, sigma_rad)
     facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
@@ -214,7 +216,7 @@ def accuracy_stage(
         warnings = better_reading(estimate[both], true[both], body, stated)
         off = None if warnings else hand_eye(estimate, true)
         if off is not None:
-            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, sigma)
+            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, sigma_m, sigma_rad)
             warnings = [misplaced(off, body, figures, without)]
             figures |= without_it(off, without)
         if warnings:

@@ -33,8 +33,6 @@ SPAN = 2
 OVERLAP = 3
 """Frames common to successive windows; they join the windows."""
 
-MIN_START_ANGLE_DEG = 0.1
-"""Triangulation angle of the images that a model begins with: a pixel of disparity at a focal length of 600."""
 
 NEAR_ANGLE_DEG = 1.5
 """Triangulation angle below which COLMAP drops a point: it registers the next images by the nearer ones alone."""
@@ -47,9 +45,6 @@ ADJUSTED_GROWTH, ADJUSTED_IMAGES, ADJUSTED_CHANGE, NEW_CHANGE = 3.0, 2, 1e-4, 1e
 new one; and relative change of the cost below which an adjustment of all, or of these, ends. COLMAP's 1.1, 6, 0 and 0
 take twice the time, and change no error by a tenth."""
 
-MIN_TRIALS = 30
-"""Samples that verification draws at least, of COLMAP's 100: nearly all matches here are right; where they are not, it
-draws more."""
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""
@@ -144,7 +139,8 @@ def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verifi
         database.write_frame(frame, use_frame_id=True)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.num_threads = SEED, 1
-    options.ransac.min_num_trials = MIN_TRIALS
+    # COLMAP's 100 are more than needed: nearly all matches are right; where they are not, it draws more.
+    options.ransac.min_num_trials = 30
     options.detect_watermark = False
     verified = {}
     for i, j in image_pairs(len(features) // 2):
@@ -223,7 +219,8 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     options.min_focal_length_ratio, options.max_focal_length_ratio = 1e-3, 1e4
     options.init_image_id1, options.init_image_id2 = start
     options.multiple_models, options.init_num_trials = False, 1
-    options.mapper.init_min_tri_angle = MIN_START_ANGLE_DEG
+    # A pixel of disparity at a focal length of 600 pixels.
+    options.mapper.init_min_tri_angle = 0.1
     options.min_model_size, options.extract_colors = 2, False
     # Adjusted less often on the way, and as well at the end.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_GROWTH

@@ -18,9 +18,6 @@ from rille.stages.facts.evaluation import JoinFacts, WindowFacts
 from rille.stages.geometry.geometry import orthonormal
 from rille.stages.geometry.rigid import alignment, by_frame, compose, posed
 
-ORIENTATION_SHARE = 1.0
-"""Orientations weigh like positions: over the few metres that windows share they are the better compass."""
-
 
 def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -> tuple[Floats, NDArray[np.int16]]:
     """Chain windows in order.
@@ -46,7 +43,8 @@ def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -
         # Shared with the piece at hand; frames of an earlier one tie nothing, for that chain is broken.
         shared = there & (piece == number) & (number >= 0)
         if shared.any():
-            local = compose(alignment(local[shared], poses[shared], ORIENTATION_SHARE), local)
+            # Orientations weigh like positions: over the few metres that windows share they are the better compass.
+            local = compose(alignment(local[shared], poses[shared], 1.0), local)
             local[shared] = _fade(poses[shared], local[shared])
         else:
             number += 1

@@ -25,8 +25,6 @@ SHIFT_CELLS = 0.25
 SURE, BESIDE, SURE_VOLUME = 4.5, 2.0, 3.5
 """Standard deviations that one cell of a change differs by, all of its cells, and its volume."""
 
-LEAST_CELLS = 6
-"""Smaller patches are what single matches make."""
 
 FOOT = 2
 """Cells about a patch in which a change runs out, below what single cells tell."""
@@ -84,7 +82,8 @@ def changes(error: Floats, deviation: Floats, grid: Grid) -> list[Change]:
             up, left = (slice(max(one.start - FOOT, 0), one.stop + FOOT) for one in (rows, cols))
             window = up, left
             patch = label[window] == k
-            if patch.sum() < LEAST_CELLS or (sign * ratio[window][patch]).max() < SURE:
+            # Single matches make smaller patches.
+            if patch.sum() < 6 or (sign * ratio[window][patch]).max() < SURE:
                 continue
             patch = scipy.ndimage.binary_dilation(patch, iterations=FOOT) & np.isfinite(error[window])
             change = _change(error[window], deviation[window] * math.sqrt(shared), patch, grid.part(window))

@@ -22,13 +22,9 @@ from rille.stages.terrain.relief.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, F
 
 Align = Literal["shift", "tilt", "rigid"]
 
-MIN_AVERAGED_RATIO = 1.5  # of cells, from which the finer model's cells are averaged instead of interpolated
-MIN_KNOWN_SHARE = 0.5  # of a coarse cell's area that the finer cells must know
 BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
 MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
-MIN_RELIEF_CELLS = 100  # known to both, from which on their relief is compared
-MIN_EXPLAINED = 0.9  # share of the relief's variance that a common factor explains
 
 
 def cell_means(fine: Grid, target: Grid) -> Floats:
@@ -49,7 +45,7 @@ def cell_means(fine: Grid, target: Grid) -> Floats:
         flat = np.ravel_multi_index((index[inside, 0], index[inside, 1]), shape)
         count += 0.25 * np.bincount(flat, minlength=size)
         total += 0.25 * np.bincount(flat, weights=values[inside], minlength=size)
-    enough = count >= MIN_KNOWN_SHARE * (target.cell / fine.cell) ** 2 * (1.0 - 1e-9)
+    enough = count >= 0.5 * (target.cell / fine.cell) ** 2 * (1.0 - 1e-9)
     return np.where(enough, total / np.where(enough, count, 1.0), np.nan).reshape(shape)
 
 
@@ -63,7 +59,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
     """
     target, fine, name = (b, a, "A") if a.cell <= b.cell * (1.0 + 1e-9) else (a, b, "B")
     ratio = target.cell / fine.cell
-    if ratio >= MIN_AVERAGED_RATIO:
+    if ratio >= 1.5:
         values = cell_means(fine, target)
         how = f"{name} averaged from {fine.cell:g} m to {target.cell:g} m (half of a cell's area known at least)"
     else:
@@ -158,14 +154,15 @@ def errors(a: Grid, b: Grid, T_b_a: RigidTransform | None = None) -> Floats:
 def relief_factor(a: Grid, b: Grid) -> float:
     """Factor of B's elevations that explains nine tenths of A's but for a plane (runs may lean); 1 where none does."""
     known = np.argwhere(np.isfinite(errors(a, b)))
-    if len(known) < MIN_RELIEF_CELLS:
+    if len(known) < 100:
         return 1.0
     row, col = known[:: len(known) // MAX_POINTS + 1].T
     z = np.stack([a.values[row, col], b.values[row, col]], axis=-1)
     plane = np.stack([row, col, np.ones(len(z))], axis=-1)
     relief = z - plane @ np.linalg.lstsq(plane, z)[0]
     (saa, sab), (_, sbb) = relief.T @ relief
-    return float(sab / sbb) if sab**2 > MIN_EXPLAINED * saa * sbb else 1.0
+    # Where a factor explains nine tenths of the relief's variance.
+    return float(sab / sbb) if sab**2 > 0.9 * saa * sbb else 1.0
 
 
 def figures(error: Floats) -> dict[str, float]:

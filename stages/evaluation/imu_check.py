@@ -16,7 +16,6 @@ import scipy
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import level_rotation
 
-MIN_STEPS = 5
 # Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
 MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
 # rad/s; the largest bias of a gyroscope, which a unit of degrees would make small, too.
@@ -45,7 +44,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     axes : (3, 3) R_imu_left.
     """
     both = np.isfinite(images).all(axis=(1, 2)) & np.isfinite(sensor).all(axis=(1, 2))
-    if both.sum() <= MIN_STEPS:
+    if both.sum() <= 5:
         return []
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)

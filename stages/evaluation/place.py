@@ -22,12 +22,6 @@ from rille.stages.imaging.features import UNIT_BYTES, match
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, fix
 from rille.stages.terrain.relief.grid import Grid
 
-KEYPOINTS = 8000
-"""Of an image."""
-
-NEAR_CELLS = 2.0
-"""Cells of the coarser image within which matches agree."""
-
 FEWEST, MOST_SCALE = 12, 0.03
 """Matches that must agree, and departure of their scale from 1."""
 
@@ -36,9 +30,6 @@ MAX_RATIO, MIN_CONTRAST = 1.5, 16.0
 
 FILL_CELLS = 4.0
 """Width of the surroundings that unknown cells take their grey value from."""
-
-RIVAL_SHARE = 0.5
-"""Of the matches that agree: when as many agree on another place, both are possible."""
 
 
 def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
@@ -67,7 +58,7 @@ def place(a: Grid, b: Grid) -> Placement:
     DegenerateError
         Too few matches agree: the images show other places, or another light; or half as many agree on another place.
     """
-    near = NEAR_CELLS * max(a.cell, b.cell)
+    near = 2.0 * max(a.cell, b.cell)
     (here, one), (there, other) = _described(a, b.cell), _described(b, a.cell)
     alike = match(one, other)
     p, q = here[alike[:, 0]], there[alike[:, 1]]
@@ -83,7 +74,8 @@ def place(a: Grid, b: Grid) -> Placement:
     middle = motion[:, :2] @ start + motion[:, 2]
     elsewhere, rival = _agreed(p[~used], q[~used], near)
     away = 0.0 if elsewhere is None else float(np.linalg.norm(elsewhere[:, :2] @ start + elsewhere[:, 2] - middle))
-    if rival.sum() > RIVAL_SHARE * agreeing and away > 2.0 * near:
+    # Half as many agree on another place: both are possible.
+    if rival.sum() > 0.5 * agreeing and away > 2.0 * near:
         text = f"the ortho image fits two places: {agreeing} and {rival.sum()} keypoints agree, {away:.3g} m apart"
         raise DegenerateError("RIL-841", text, remedy="give images of more ground, or a start")
     arm = p[used] - start
@@ -125,7 +117,7 @@ def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), FILL_CELLS) for v in (np.where(known > 0, grey, 0), known)]
     grey = np.where(known > 0, grey, around[0] / np.maximum(around[1], 1e-6))
     # Without it keypoints lie a part of a cell off their places.
-    sift = cv2.SIFT.create(KEYPOINTS, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(8000, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(np.clip(grey, 0, 255).astype(np.uint8), known.astype(np.uint8))
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)

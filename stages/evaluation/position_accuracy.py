@@ -47,8 +47,6 @@ MIN_SHARE = 2 / 3
 EQUAL_ERROR = 2**0.5
 """Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
 
-SAME_TIME_S = 1e-6
-"""Difference below which two times are the same."""
 
 MAX_RANGE_SHARE = 0.5
 """Share of the searched range: where equally good offsets span more, the offset is not determined."""
@@ -87,7 +85,7 @@ class TruePositions:
         known = (start <= moments) & (moments <= end) & (end - start <= self.max_gap)
         # At a row itself a gap beside it does not matter; and times are written with few digits: the first and the last
         # image must not fall out by a rounding.
-        known |= np.minimum(np.abs(moments - start), np.abs(moments - end)) <= SAME_TIME_S
+        known |= np.minimum(np.abs(moments - start), np.abs(moments - end)) <= 1e-6
         places = np.stack([np.interp(moments, self.times, axis) for axis in self.positions.T], axis=1)
         return np.where(known[:, None], places, np.nan)
 

@@ -44,9 +44,6 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
 MIN_FOCAL_SHARE = 0.7
 """A fisheye's ideal camera keeps at least this share of its focal length, so half of the pixels at the centre."""
 
-SOLVED_PX = 1e-6
-"""Raw pixels by which the inverse may miss: far below what any match resolves."""
-
 
 CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
@@ -159,7 +156,8 @@ class Lens:
             todo = np.arange(len(raw))
             for _ in range(10):  # steps of Newton double the digits, and the start is right to a pixel
                 here = self._project(rays[todo])
-                unsolved = ~(np.hypot(*(here - raw[todo]).T) < SOLVED_PX)
+                # A millionth of a pixel: far below what any match resolves.
+                unsolved = ~(np.hypot(*(here - raw[todo]).T) < 1e-6)
                 todo, here = todo[unsolved], here[unsolved]
                 if not todo.size:
                     break

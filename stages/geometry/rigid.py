@@ -15,9 +15,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 
-REST_LEVER_M = 1.0
-"""Lever of a camera at rest: far beyond the millimetres of its positions."""
-
 
 def posed(poses: Floats) -> Bools:
     """Which of the poses (frame, 3, 4), or other matrices, are there, i.e. without NaN."""
@@ -104,7 +101,8 @@ def alignment(source: Floats, target: Floats, share: float) -> Floats:
     """
     lever = share * spread(target)
     if lever < 1e-6 or not np.isfinite(lever):
-        lever = REST_LEVER_M
+        # Far beyond the millimetres of its positions.
+        lever = 1.0
     return np.column_stack(umeyama(_points(source, lever), _points(target, lever)))
 
 

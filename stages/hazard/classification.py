@@ -35,8 +35,6 @@ SAFE, CAUTION, HAZARDOUS, UNKNOWN = 0, 1, 2, 3
 
 UNKNOWN_BIT, FILLED_BIT, DOUBT_BIT, UNSEEN_BIT = 1 << 7, 1 << 8, 1 << 9, 1 << 10
 
-MIN_WHOLE_SHARE = 0.999
-"""Share of a window from which it counts as wholly known."""
 
 HIDDEN_STEPS = 0.5
 """Steps of the vehicle by which unknown ground widens the doubt of a measure, where all of the wheel's window, or of
@@ -59,8 +57,6 @@ LIFT_START_EXCESS = -0.4
 LIFT_WIDTH_EXCESS = 0.6
 """Excess over which the rise of t grows to the whole of it."""
 
-MIN_RELATIVE_STD = 1e-12
-"""Smallest standard deviation of a measure, as a share of its limit: the excess of exact elevations is then finite."""
 
 NO_BITS = np.uint16(0)
 
@@ -128,7 +124,7 @@ def classify(
     # In proportion to the unknown share, and of a step, since anything higher shows at the rim of the known ground.
     hidden = np.float32(HIDDEN_STEPS * terrain.vehicle.max_step)
     doubt = np.hypot(noise, hidden * np.stack([1.0 - np.minimum(share, 1.0), patchy]))
-    flags = np.where((share < MIN_WHOLE_SHARE) | (patchy > 0), np.uint16(UNSEEN_BIT), NO_BITS)
+    flags = np.where((share < 0.999) | (patchy > 0), np.uint16(UNSEEN_BIT), NO_BITS)
 
     def spread(a: AnyArray) -> AnyArray:
         """Cells (row, col) of blocks."""
@@ -182,7 +178,8 @@ def _judged(
         # Hidden ground can only raise a measure, so it makes no hazard less certain.
         std = np.where(above > 0, noise, doubt)
         load = np.maximum(load, own)
-        excess = np.maximum(excess, above / (f(spread) * std + f(MIN_RELATIVE_STD) * limit))
+        # The second term keeps the excess of exact elevations finite.
+        excess = np.maximum(excess, above / (f(spread) * std + f(1e-12) * limit))
         over = over | np.where(own > 1, np.uint16(m.bit), NO_BITS)
     return Verdicts(load, excess, over)
 

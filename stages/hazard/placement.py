@@ -34,9 +34,6 @@ Ints = NDArray[np.int64]
 HEADINGS = 8
 """Over half a turn, since the footprint is the same backwards: 22.5 degrees move a wheel by less than its diameter."""
 
-PLACES_PER_WHEEL = 7
-"""Places along a wheel's diameter, at least."""
-
 
 class Places(NamedTuple):
     """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
@@ -110,7 +107,8 @@ def _rotation(angle: float) -> Floats:
 
 def stride(vehicle: Vehicle, cell: float) -> int:
     """Cells from place to place."""
-    return max(1, int(vehicle.wheel_diameter / (PLACES_PER_WHEEL * cell) + 1e-6))
+    # At least seven places along a wheel's diameter.
+    return max(1, int(vehicle.wheel_diameter / (7 * cell) + 1e-6))
 
 
 def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: Bools) -> Places:

@@ -131,9 +131,6 @@ def _overlay(m: Map, u: AnyArray, v: AnyArray, known: NDArray[np.bool_]) -> Map:
     return Map(np.where(known, u, m.u), np.where(known, v, m.v))
 
 
-MAX_FIT_PIXELS = 4000
-"""Pixels that a polynomial is fitted to at most."""
-
 MIN_FIT_PIXELS = 100
 """Pixels that a polynomial needs at least."""
 
@@ -193,7 +190,7 @@ def guess(left: Image, right: Image, level: int) -> Floats:
 
 def ratio_of_matches(left: Image, right: Image, state: State) -> Floats | None:
     """Ratio of the grey values of the consistent matches of a level; None where they are too few."""
-    y, x = thinned(state.left_ok, MAX_FIT_PIXELS)
+    y, x = thinned(state.left_ok, 4000)
     p, q = x + state.left.u[y, x].astype(np.int64), y + state.left.v[y, x].astype(np.int64)
     a, b = left.layers[state.level].grey[y, x], right.layers[state.level].grey[q, p]
     # At MIN_GREY one grey level is a quarter of the value, five times MIN_LOG_SCATTER; at the top values are clipped.

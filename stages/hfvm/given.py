@@ -115,9 +115,6 @@ MIN_MATCHES = 100
 MAX_FIT_MATCHES = 2000
 """Matches that the lines are fitted to."""
 
-MAX_PATCHES = 150
-"""Matches whose likeness is sought."""
-
 
 PATCH_RADIUS_PX = 8
 """Pixels: half side of a patch."""
@@ -194,7 +191,7 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
     keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
     chosen = np.flatnonzero(keep)
-    chosen = chosen[:: -(-len(chosen) // MAX_PATCHES) or 1]
+    chosen = chosen[:: -(-len(chosen) // 150) or 1]
     looks_alike = []
     for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
         patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]

@@ -26,8 +26,6 @@ UNIT_BYTES = 512.0
 MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
 """COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
 
-MASK_SCALES = 3.0
-"""Distance to the mask, in scales of the feature, below which a feature is dropped: it may describe the edge."""
 
 MAX_FEATURES, MAX_IMAGE_SIDE = 1300, 1400
 """Features of an image, of most contrast; and pixels of its longer side, above which it is reduced before."""
@@ -88,7 +86,8 @@ def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools
     distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
     cols, rows = np.floor(points).astype(np.intp).T
     inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
-    return np.asarray(inside > MASK_SCALES * scale)
+    # Nearer ones may describe the edge of the mask.
+    return np.asarray(inside > 3.0 * scale)
 
 
 def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:

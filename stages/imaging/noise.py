@@ -22,8 +22,6 @@ from rille.stages.core.declare import AnyArray
 BLOCK_SIDE_PX = 16
 """Pixels of level 0; level 1 shows the same block by half as many."""
 
-MIN_BLOCKS = 20
-"""Blocks without a masked pixel that an estimate needs."""
 
 SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32) / np.sqrt(np.float32(6))
 """Leaves white noise its variance."""
@@ -42,7 +40,7 @@ def standard_deviation(images: Sequence[AnyArray], masks: Sequence[AnyArray]) ->
     rows, cols = squares[0].shape
     variances = (squares[0] - squares[1][:rows, :cols]) / 0.75
     variances = variances[~np.isnan(variances)]
-    return float(np.sqrt(max(np.median(variances), 0.0))) if variances.size >= MIN_BLOCKS else 0.0
+    return float(np.sqrt(max(np.median(variances), 0.0))) if variances.size >= 20 else 0.0
 
 
 def _mean_squares(image: AnyArray, mask: AnyArray, side: int) -> AnyArray:

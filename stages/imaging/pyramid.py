@@ -35,15 +35,6 @@ class PyramidParams(Params):
     )
 
 
-MIN_FRAME_PX = 8
-"""Pixels of a side that a black frame touches at least."""
-
-MIN_FRAME_SHARE = 0.1
-"""Share of a side that a black frame touches at least."""
-
-MAX_FRAME_DEPTH_SHARE = 0.1
-"""Share of the shorter side that a black frame reaches in."""
-
 MIN_VALID = 3
 """Valid pixels of four that make a coarse pixel valid. A frame one pixel wide doubles its width so, in pixels of the
 image, from level to level."""
@@ -185,11 +176,12 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
     """
     dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
-    least = [max(MIN_FRAME_SHARE * dark[side].size, MIN_FRAME_PX) for side in sides]
+    # A frame touches a tenth of a side at least, and reaches in by a tenth of the shorter side at most.
+    least = [max(0.1 * dark[side].size, 8) for side in sides]
     if all(np.count_nonzero(dark[side]) < n for side, n in zip(sides, least, strict=True)):
         return None
     count, label = cv2.connectedComponents(dark.view(np.uint8), connectivity=4)
-    deep = int(np.ceil(MAX_FRAME_DEPTH_SHARE * min(image.shape)))
+    deep = int(np.ceil(0.1 * min(image.shape)))
     inside = np.unique(label[deep:-deep, deep:-deep])
     framed, touched = np.zeros(image.shape, bool), np.zeros(image.shape, bool)
     for side, n in zip(sides, least, strict=True):

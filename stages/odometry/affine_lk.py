@@ -21,16 +21,8 @@ from rille.stages.geometry.cubic import cubic
 HALF = 5
 """Half the template's side: 11 x 11 pixels hold enough texture and still look plane."""
 SIDE = 2 * HALF + 1
-STEPS = 15
-"""Most steps before a template is given up; five are usual."""
 SETTLED_PX = 0.01
 """Step below which a template has converged: a tenth of the error that remains."""
-MIN_TEXTURE = 1e-9
-"""Sum of squared differences [grey levels] in each direction, below which a template has none: it is rounding."""
-MIN_CONTRAST = 1e-9
-"""Grey levels below which a square is flat: no contrast makes a template of it."""
-MIN_AREA = 0.1
-"""Area of a template over that in its first frame, below which it draws no texture."""
 
 
 class Templates(NamedTuple):
@@ -73,9 +65,10 @@ def align(
     contrast = np.linalg.norm(template, axis=1, keepdims=True)
     gram = descent @ np.swapaxes(descent, 1, 2)
     xx, yy, xy = gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1]
-    # Not so where the template leaves the image, is flat, or has one direction only.
-    textured = xx * yy - xy**2 > MIN_TEXTURE * (xx + yy)
-    live = np.flatnonzero(textured & (np.abs(np.linalg.det(templates.affinity)) > MIN_AREA))
+    # Not so where the template leaves the image, is flat, or has one direction only: less than 1e-9 is rounding.
+    textured = xx * yy - xy**2 > 1e-9 * (xx + yy)
+    # A template that has shrunk to a tenth draws no texture.
+    live = np.flatnonzero(textured & (np.abs(np.linalg.det(templates.affinity)) > 0.1))
     # Weight of the prior in squared grey levels: variance of a grey difference over that of an element of the affinity.
     ridge = (noise / spread) ** 2
     prior = np.array([0.0, 0.0, ridge, ridge, ridge, ridge, 0.0, 0.0])
@@ -85,7 +78,8 @@ def align(
     unexpected[live] = np.linalg.inv(templates.affinity[live])
     # Steps are composed into the affinity; the prior pulls towards what was expected.
     at, affinity = templates.start[live], templates.affinity[live]
-    for _ in range(STEPS):
+    # Five steps are usual.
+    for _ in range(15):
         grey = _drawn(b, at, affinity, HALF)
         inside = np.isfinite(grey).all(1)
         live, at, affinity = live[inside], at[inside], affinity[inside]
@@ -123,7 +117,7 @@ def _descent(a: Floats32, points: Floats) -> tuple[Floats, Floats]:
 def _levelled(grey: Floats, contrast: Floats) -> Floats:
     """Grey values (n, k) less their mean, at the contrast (n, 1) of their template: of the same exposure."""
     off = grey - grey.mean(1, keepdims=True)
-    return np.asarray(off * (contrast / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), MIN_CONTRAST)))
+    return np.asarray(off * (contrast / np.maximum(np.linalg.norm(off, axis=1, keepdims=True), 1e-9)))
 
 
 def _offsets(half: int) -> Floats:

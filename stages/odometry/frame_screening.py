@@ -37,8 +37,6 @@ Asks = dict[str, list[Any]]
 SIDES = ("left", "right")
 GREYS = ((MAX_DARK_GREY, "black"), (MIN_BRIGHT_GREY, "uniform"), (np.inf, "white"))
 """Largest mean grey value of a uniform image, and how it is called."""
-QUIET = 0.25
-"""Quantile of the changes that counts as usual: one exchanged frame changes three steps, half of a short sequence."""
 
 
 SIMULTANEOUS_SHARE = 0.6
@@ -198,7 +196,8 @@ def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeni
     """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
     if not changes:
         return []
-    limit = max(params.jump, params.jump * float(np.quantile(changes, QUIET, method="lower")))
+    # A quarter is usual: one exchanged frame changes three steps, half of a short sequence.
+    limit = max(params.jump, params.jump * float(np.quantile(changes, 0.25, method="lower")))
     found = {n for k, value in enumerate(changes) if value > limit for n in frames[k : k + 3]}
     return [f for f in frames if f in found]
 

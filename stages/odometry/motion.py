@@ -78,8 +78,6 @@ MIN_ROLL_DEG = 10.0
 """Rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
 MIN_TEXTURED = 100
 """Pixels with texture, at the coarse level, from which on a rotation can show."""
-MIN_GAIN = 1.2
-"""A homography is believed if it raises the share of matches by a fifth; chance matches do not."""
 
 
 def coarse_motion(a: Pyramid, b: Pyramid, params: MotionParams, turn: plane.Matrix | None = None) -> Motion:
@@ -135,7 +133,8 @@ def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Moti
     textured = int(np.count_nonzero((plain.validity & np.uint8(Validity.NO_TEXTURE)) == 0))
     if params.turn_below == 0 or textured < MIN_TEXTURED:
         return None
-    share, needed = matched_share(plain.validity), MIN_GAIN
+    # A homography is believed if it raises the share by a fifth: chance matches do not.
+    share, needed = matched_share(plain.validity), 1.2
     if share >= params.turn_below:
         # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
         if abs(_roll_deg(plain)) < MIN_ROLL_DEG:

@@ -29,10 +29,6 @@ from rille.stages.odometry.displacements import fit_affinity, known_median
 BLOCKS = 200
 """Approximate number of blocks of an image; more change the overlap by less than 1 %, at a cost that grows with their
 square."""
-MATCHED_SHARE = 0.5
-"""Share of a block's pixels that must be matched for its median to count: fewer may agree by chance."""
-MIN_BLOCKS = 12
-"""Number of blocks with a displacement below which a step shows no motion."""
 MIN_MATCHES = 0.2
 """Share of the textured pixels that must find a displacement for two frames to count as overlapping."""
 
@@ -57,12 +53,13 @@ class Step:
         # By the area, so that images of all shapes have about as many blocks.
         side = max(1, round((known.size / BLOCKS) ** 0.5))
         inside = _blocks(known, side)
-        enough = inside.mean(-1) >= MATCHED_SHARE
+        # Fewer may agree by chance.
+        enough = inside.mean(-1) >= 0.5
         shift = np.full((*enough.shape, 2), np.nan)
         for k, name in enumerate(("column_disparity", "row_disparity")):
             values = np.where(inside, _blocks(np.asarray(bundle[name]), side), np.float32(np.nan))
             shift[enough, k] = known_median(values[enough], inside[enough].sum(-1))
-        shown = np.count_nonzero(enough) >= MIN_BLOCKS
+        shown = np.count_nonzero(enough) >= 12
         return Step(shift, side * 2.0 ** bundle.meta["level"], matched_share(validity) if shown else 0.0)
 
     @property

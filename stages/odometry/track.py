@@ -39,8 +39,6 @@ BORDER = 8
 REACH_PX = 4.0
 """Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
 
-SETTLED_BACK_PX = 0.03
-"""Step below which the alignment back has converged: a fraction of what it may miss by."""
 
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
@@ -155,7 +153,7 @@ def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates,
     good = np.flatnonzero(clear_of_mask(valid, place, HALF))
     inverse = np.asarray(np.linalg.inv(templates.affinity[good]), np.float64)
     back = Templates(place[good], templates.points[good], inverse)
-    miss = align(b, a, back, **how, settled=SETTLED_BACK_PX) - templates.points[good]
+    miss = align(b, a, back, **how, settled=0.03) - templates.points[good]
     kept = np.isin(np.arange(len(place)), good[np.hypot(*miss.T) <= MAX_RETURN_PX])
     return np.where(kept[:, None], place, np.nan)
 

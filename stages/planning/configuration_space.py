@@ -20,8 +20,6 @@ STRAIGHT, RIGHT, ACROSS, LEFT = 1, 2, 4, 8
 """Bits of the directions: along columns; to row 0 and greater columns; along rows; to row 0 and smaller columns."""
 DIRECTED_STEPS = ((STRAIGHT, -1, 0), (RIGHT, -1, 1), (ACROSS, 0, 1), (LEFT, -1, -1))
 """Bit, row and column of one step in each direction."""
-ROUNDING_CELLS = 1e-9
-"""Cells by which rounding alone may make a whole number of cells larger."""
 
 
 def distance(mask: Bools, cell: float) -> Floats32:
@@ -93,7 +91,7 @@ class FreePlaces:
 def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
     """Cells from which a rectangle, cells, aligned with ``step`` (row, col), touches the mask or leaves the map."""
     # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
-    along, across = (max(0, math.ceil(v / math.hypot(*step) - ROUNDING_CELLS)) for v in (half_length, half_width))
+    along, across = (max(0, math.ceil(v / math.hypot(*step) - 1e-9)) for v in (half_length, half_width))
     lines = [_line(along, *step), _line(across, step[1], -step[0])]
     if step[0] and step[1]:
         # A diagonal line leaves every other cell out; three cells of a row close them.

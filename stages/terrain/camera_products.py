@@ -23,9 +23,6 @@ from rille.stages.terrain.points import PairPoints
 NORMAL_SIDE_PX = 11
 """Pixels: side of the window that a normal is fitted to."""
 
-MIN_MATCHED_SHARE = 0.3
-"""Of the window's pixels, that must be matched."""
-
 
 @dataclass(frozen=True)
 class CameraProducts:
@@ -76,7 +73,7 @@ def _planes(position: Floats32) -> tuple[Floats32, Floats32]:
     full = np.nanmax(determinant, initial=0.0)
     usable = (
         # Rays that lie on a line have no normal: their covariance is far below that of a full window.
-        known & (count >= MIN_MATCHED_SHARE * NORMAL_SIDE_PX * NORMAL_SIDE_PX) & (determinant > 1e-6 * full)
+        known & (count >= 0.3 * NORMAL_SIDE_PX * NORMAL_SIDE_PX) & (determinant > 1e-6 * full)
     )
     inverse = 1.0 / np.where(usable, determinant, 1.0)
     nx, ny = (xr * yy - yr * xy) * inverse, (yr * xx - xr * xy) * inverse

@@ -53,13 +53,9 @@ SCENE = "scene"
 MAX_TILT_DEG = 30.0  # largest slope of the ground, and largest roll of an unknown attitude
 MIN_PITCH_DEG, MAX_PITCH_DEG = -20.0, 75.0  # downward pitch of a rig whose attitude is unknown
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
-MAX_HEIGHTS = 2.0  # greatest elevation above the ground that is searched, camera heights
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
-MAX_FIT_PIXELS = 5000  # matched pixels that the plane is fitted to: three parameters need no more
 BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
 MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the reference, though tilted beyond the limits
-MAX_SLANT_DEG = 65.0  # between the view and a scene plane's normal: what is seen along the plane makes no map
-MAX_SIGMA_RATIO = 10.0  # to the median one: a match so uncertain brings a hundredth of the median one's weight
 
 
 class GroundFrameParams(Params):
@@ -207,7 +203,8 @@ def scene_plane(samples: Samples) -> GroundPlane:
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
-        plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(MAX_SLANT_DEG))))
+        # What is seen along a plane makes no map.
+        plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(65.0))))
         if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
     return GroundPlane(np.array([0.0, 0.0, -1.0]), 1.0 / max(float(np.median(rho)), 1e-9))
@@ -239,7 +236,8 @@ def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, sigma_disparit
     if not len(view.slant):
         raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
     cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
-    max_sigma = float(f"{MAX_SIGMA_RATIO * np.median(sigma_disparity / view.slope):.2g}")
+    # A match so uncertain has a hundredth of the median one's weight.
+    max_sigma = float(f"{10.0 * np.median(sigma_disparity / view.slope):.2g}")
     footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, sigma_disparity, max_sigma)
     relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, RELIEF_MARGIN_SHARE * reference.height)
     return {
@@ -272,7 +270,8 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
     """Rays, inverse depths and their errors at a regular sparse grid of usable pixels; ``maps``: both disparities."""
     column, row = maps
     rig.check(column.shape)
-    step = max(1, int(math.sqrt(column.size / (2 * MAX_FIT_PIXELS))))
+    # Some 5000 of them: three parameters need no more.
+    step = max(1, int(math.sqrt(column.size / 10_000)))
     r, c = np.nonzero(usable[::step, ::step])
     r, c = r * step, c * step
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
@@ -317,8 +316,8 @@ def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:
 def _relief(points: Floats, plane: list[float], extent: list[float], height: float) -> list[float]:
     """Robust lowest and highest terrain against the plane within the extent, metres, as far as ground reaches."""
     low, high = _spread(points, plane, extent, RELIEF_MARGIN_SHARE * height)
-    # Below, nothing is known that deep but mismatches; above, walls and crowns.
-    return [max(low, -height), min(high, MAX_HEIGHTS * height)]
+    # Below, nothing is known that deep but mismatches; two heights above, walls and crowns.
+    return [max(low, -height), min(high, 2.0 * height)]
 
 
 def _spread(points: Floats, plane: list[float], extent: list[float], margin: float) -> list[float]:

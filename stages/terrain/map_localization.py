@@ -43,16 +43,8 @@ from rille.stages.terrain.shading import gradient
 
 MIN_CELLS = 30
 """Cells of the map that the model must cover."""
-MIN_BLOCK_SHARE = 0.3
-"""Of a block's area that the model must know."""
-MAX_CELLS = 10_000
-"""Cells of the map within the model: a finer map is averaged first."""
-MIN_SEARCHED_CELLS = 100
-"""Cells of the model in the coarsest version that is searched: fewer tell too little."""
 MAX_TRIES, MAX_TRIES_AT_ALL = 3e6, 2e8
 """Headings times cells: above, a coarser version is searched where there is one; and what is refused."""
-PLACES = 8
-"""Best places that are refined."""
 NEIGHBOURS = 3
 """Steps of the search, within which a place is a neighbour: it belongs to the same valley."""
 MORE_TURN = math.radians(20.0)
@@ -63,9 +55,6 @@ had 148 at least at their right places, 7 at most in the map of another bed; on 
 MIN_EXPLAINED = 0.6
 """Of the relief that is compared, below which a place is in doubt. Stops on seeds 1 and 2 had .80 at least at their
 right places, .51 at most in the map of another bed."""
-HUBER_SIGMAS = 1.5
-MAX_ALIKE = 0.95
-"""Correlation of neighbouring differences that is believed at most."""
 
 
 class MapLocalizationParams(Params):
@@ -135,7 +124,7 @@ def thin(model: Grid, cell: float) -> ModelBlocks:
     shape = int(at[:, 0].max()) + 1, int(at[:, 1].max()) + 1
     index = at[:, 0] * shape[1] + at[:, 1]
     count = np.bincount(index, minlength=shape[0] * shape[1])
-    full = count >= max(1.0, MIN_BLOCK_SHARE * (cell / model.cell) ** 2)
+    full = count >= max(1.0, 0.3 * (cell / model.cell) ** 2)
     sums = (np.bincount(index, values, minlength=len(count)) for values in points.T)
     means = np.stack([total[full] / count[full] for total in sums], axis=1)
     mean = np.full(shape, np.nan)
@@ -160,7 +149,8 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
     around = around or SearchArea(x, y)
     around = replace(around, distance=min(around.distance, everywhere + math.hypot(x - around.x, y - around.y)))
     area = int(np.isfinite(model.values).sum()) * model.cell**2
-    while ground.cell < (1 - 1e-6) * model.cell or area > MAX_CELLS * ground.cell**2:
+    # A map of more cells within the model is averaged first.
+    while ground.cell < (1 - 1e-6) * model.cell or area > 10_000 * ground.cell**2:
         ground = ground.halved()
     blocks = thin(model, ground.cell)
     if len(blocks.points) < MIN_CELLS:
@@ -173,7 +163,8 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
     wide = replace(around, distance=around.distance + far, turn=min(around.turn + MORE_TURN, math.pi))
     ground = ground.within((wide.x, wide.y), wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
     coarse = ground
-    while _tries(coarse, far, wide) > MAX_TRIES and area > 4 * MIN_SEARCHED_CELLS * coarse.cell**2:
+    # Fewer than a hundred cells tell too little.
+    while _tries(coarse, far, wide) > MAX_TRIES and area > 400 * coarse.cell**2:
         coarse = coarse.halved()
     if (tries := _tries(coarse, far, wide)) > MAX_TRIES_AT_ALL:
         text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
@@ -238,7 +229,7 @@ def _search(
             f"{around.y:.2f}) m, {min_overlap:.0%} are needed",
             remedy="give a map that covers the start, or a better start",
         )
-    for _ in range(PLACES):
+    for _ in range(8):
         at = np.unravel_index(int(np.argmin(scores)), scores.shape)
         if not np.isfinite(scores[at]):
             return
@@ -280,7 +271,7 @@ def _refined(
     """The model laid on the map, no farther than ``near``, m, away; None where it leaves the map at once."""
     rules = FitRules(
         least=max(0.5 * params.min_overlap * len(blocks.points), MIN_CELLS / 2),
-        weigh=lambda r, sigma: huber_weight(np.abs(r), HUBER_SIGMAS * sigma),
+        weigh=lambda r, sigma: huber_weight(np.abs(r), 1.5 * sigma),
         sigma_tilt=math.radians(params.sigma_tilt_deg),
         near=near,
     )
@@ -333,7 +324,7 @@ def independent_cells(field: Floats) -> float:
     products = np.concatenate([(field[1:] * field[:-1]).ravel(), (field[:, 1:] * field[:, :-1]).ravel()])
     products, square = products[np.isfinite(products)], float(np.nanmean(field**2))
     alike = float(products.mean()) / max(square, 1e-30) if products.size else 0.0
-    alike = min(max(alike, 0.0), MAX_ALIKE)
+    alike = min(max(alike, 0.0), 0.95)
     return float(np.isfinite(field).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
 
 

@@ -16,16 +16,13 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.core.quantities import metres
 from rille.stages.facts.terrain import AuditFacts, OverlapFacts
 
 Facts = Mapping[str, Any]
 
 MAX_NAMED = 3
 """Models that a warning names."""
-MAX_LISTED = 500
-"""Seams in the result, the worst first: a long sequence has tens of thousands."""
-MIN_IN_METRES = 0.1
-"""Error, m, from which on it is stated in metres, smaller ones in millimetres."""
 
 
 class OverlapAuditParams(Params):
@@ -84,11 +81,10 @@ def describe(model: Facts) -> str:
     tilts = [math.degrees(t) for t in model["tilt"]]
     against = "pairs" if len(model["neighbours"]) > 1 else "pair"
     names = ", ".join(str(n) for n in model["neighbours"][:4]) + (", ..." if len(model["neighbours"]) > 4 else "")
-    unit, per_m = ("mm", 1000.0) if model["systematic"] < MIN_IN_METRES else ("m", 1.0)
-    off, expected, bias = (per_m * model[name] for name in ("systematic", "expected", "bias"))
+    off, expected, bias = (metres(model[n], signed=n == "bias") for n in ("systematic", "expected", "bias"))
     words = (
-        f"pair {model['pair']} against {against} {names}: {off:.2g} {unit} where sigma allows {expected:.2g} {unit} "
-        f"(offset {bias:+.2g} {unit}, tilt {tilts[0]:+.2g} deg along x, {tilts[1]:+.2g} deg along y)"
+        f"pair {model['pair']} against {against} {names}: {off} where sigma allows {expected} "
+        f"(offset {bias}, tilt {tilts[0]:+.2g} deg along x, {tilts[1]:+.2g} deg along y)"
     )
     return words + (", either may be wrong" if model["either"] else "")
 
@@ -104,7 +100,7 @@ def overlap_audit_stage(params: OverlapAuditParams, seams: Sequence[Bundle[Overl
     facts: AuditFacts = {
         "models": models,
         "seam_count": len(ranked),
-        "seams": [{k: s[k] for k in kept} for s in ranked[:MAX_LISTED]],
+        "seams": [{k: s[k] for k in kept} for s in ranked[:500]],  # of tens of thousands
         "warnings": [],
     }
     if bad:

@@ -23,9 +23,6 @@ from rille.stages.facts.terrain import OverlapFacts, RadiometryFacts
 
 LOG_GAIN_STEP = 0.01
 """Step of log g: half a step is 0.6 of 128 grey values."""
-SWAY_SHARE = 1e-3
-"""Of all squared steps of the models: a direction with less tells no gradient. With a hundredth a chain of ten models
-of one exposure got a slope of a fifth from end to end, and random exposures were left half."""
 FADING_WEIGHT = 0.05
 """Weight of the second term: a lasting change fades by 1/e over sqrt(1 / FADING_WEIGHT) = 4.5 models of a chain."""
 
@@ -52,8 +49,9 @@ def level(centres: Mapping[int, Sequence[float]], ratios: Sequence[tuple[int, in
     values = np.column_stack([np.tile([-1.0, 1.0], (len(ordered), 1)), -moved]).ravel()
     design = coo_array((values, (rows, cols)), shape=(len(ordered), n + 2)).tocsc()
     wanted = -np.array([ratio for _, _, ratio in ordered])
-    # A direction in which the cameras hardly move, such as sway, shows no gradient: the ridge holds it at 0.
-    small = SWAY_SHARE * max(float((moved**2).sum()), 1e-9)
+    # A direction in which the cameras hardly move, such as sway, shows no gradient: the ridge holds it at 0. With
+    # a hundredth, ten models of one exposure got a slope of a fifth from end to end, and random exposures stayed half.
+    small = 1e-3 * max(float((moved**2).sum()), 1e-9)
     ridge = diags_array(np.array([FADING_WEIGHT] * n + [small] * 2))
     solved = spsolve((design.T @ design + ridge).tocsc(), design.T @ wanted)[:n]
     # Beyond a factor of 2 it is not exposure.

@@ -494,8 +494,9 @@ def test_unit_and_lever_arm_of_the_truth(tmp_path):
     assert [pose.translation.tolist() for pose in s.truth] == [[x, 0.0, 2.0] for x in (1.5, 2.5, 3.5)]
     assert s.truth_mount.translation.tolist() == [0.0, 0.0, 2.0]
     arm, sigma = "lever_arm = [0.1, -0.2, 0.3]\n", "sigma_m = 0.02\nsigma_deg = 0.1\n"
-    assert s.truth_sigma == (0.0, 0.0)
-    assert opened(write_sequence(tmp_path, text + sigma)).truth_sigma == pytest.approx((0.02, math.radians(0.1)))
+    assert (s.truth_sigma_m, s.truth_sigma_rad) == (0.0, 0.0)
+    stated = opened(write_sequence(tmp_path, text + sigma))
+    assert (stated.truth_sigma_m, stated.truth_sigma_rad) == pytest.approx((0.02, math.radians(0.1)))
     with raises("RIL-782", "p.txt", "T_body_left"):
         opened(write_sequence(tmp_path, text + arm))
     write_lines(tmp_path / "p.txt", ["x y", "1000 0", "2000 0", "3000 0"])

@@ -14,9 +14,9 @@ from rille.datasets.manifest.opening import dotted
 from rille.datasets.text.reading import read_toml
 from rille.pipeline import api
 from rille.pipeline.engine import events
-from rille.pipeline.report.words import metres, quantity
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, Run, Runs
+from rille.stages.core.quantities import metres, quantity
 
 
 def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:

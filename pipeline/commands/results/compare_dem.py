@@ -19,11 +19,11 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.read_dem import DemFile, crs_name
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
-from rille.pipeline.report.words import metres
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
+from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation
 from rille.stages.evaluation.place import register

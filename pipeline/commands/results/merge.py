@@ -19,11 +19,11 @@ from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, check_folder, write_raster
-from rille.pipeline.report.words import metres
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment
 from rille.stages.evaluation.place import register
@@ -215,7 +215,7 @@ def _line(one: Session) -> str:
     overlap = one.facts["overlap"]
     turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])
     sigma = f"sigma {', '.join(map(metres, one.sigma[:3]))}, {turn:.2g} degrees; by {one.facts['by']}"
-    median, nmad, p95 = (metres(overlap[name]) for name in ("median", "nmad", "p95"))
+    median, nmad, p95 = (metres(overlap[name], signed=name == "median") for name in ("median", "nmad", "p95"))
     return (
         f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); "
         f"{overlap['cells']:.0f} cells in common: median {median}, NMAD {nmad}, 95 % {p95}"

@@ -28,22 +28,10 @@ from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigC
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
 
-SAME_PLACE_PX = 1.0
-"""RMS distance of all corners below which two views show the board at one place: noise moves them by tenths, a hand by
-many."""
-
 MAX_CLUTTER = 0.1
 """Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths. It
 holds for any resolution and distance of the board."""
 
-MAX_RMS_PX = 1.0
-"""Residual over all views that a chessboard on paper does not exceed."""
-
-MAX_FOCAL_SIGMA = 0.01
-"""Relative standard deviation of a focal length that is worth a warning: all depths err by as much."""
-
-MIN_COVER = 0.5
-"""Share of an image that all corners together should span: beyond them, distortion is extrapolated."""
 
 Image = NDArray[Any]
 
@@ -67,7 +55,8 @@ class Boards:
             missing = [side for side, points in zip(CAMERAS, (left, right), strict=True) if points is None]
             return f"no whole board in the {' nor in the '.join(missing)} image"
         view = BoardView(name, left, chessboard.same_order(left, right, self.corners))
-        same = next((other.name for other in self.views if _distance(view, other) < SAME_PLACE_PX), None)
+        # Of one place: noise moves all corners by tenths of a pixel, a hand by many pixels.
+        same = next((other.name for other in self.views if _distance(view, other) < 1.0), None)
         if same is not None:
             return f"the board stands as in view {same}"
         self.views.append(view)
@@ -211,17 +200,20 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         if not r.used:
             text = f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
             yield warning("RIL-695", text)
-    if rig.rms > MAX_RMS_PX:
+    # More than a chessboard on paper leaves.
+    if rig.rms > 1.0:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
     for side, size in zip(CAMERAS, boards.sizes, strict=True):
         share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
-        if share > MAX_FOCAL_SIGMA:
+        # All depths err by as much.
+        if share > 0.01:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             yield warning("RIL-697", text)
         seen = cover([getattr(view, side) for view in used], size)
-        if seen < MIN_COVER:
+        # Beyond the corners, distortion is extrapolated.
+        if seen < 0.5:
             text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
             yield warning("RIL-698", text)
         known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}

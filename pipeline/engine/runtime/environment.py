@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 from contextlib import suppress
 from functools import cache
 
 from rille.pipeline.engine.runtime.apart import absolute_search_paths
 from rille.pipeline.engine.runtime.kernels import use_own_folder
+from rille.stages.core.errors import ConfigError
 
 SINGLE = ("OMP", "OPENBLAS", "MKL", "NUMBA", "BLIS", "VECLIB_MAXIMUM", "NUMEXPR")
+MIN_OPEN_FILES = 128
 
 
 def worker_environment() -> dict[str, str]:
@@ -43,6 +46,23 @@ def _keep_memory() -> None:
         # By default it gives back every array, and a tenth of the time of matching goes into taking memory anew.
         mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD: bytes of a block that it takes from the system by itself
         mallopt(-1, 256 << 20)  # M_TRIM_THRESHOLD: bytes of free memory from which on it gives it back
+
+
+def permit_open_files() -> None:
+    """Let this process open as many files as the system permits: pipes of workers, libraries, artifacts.
+
+    Raises
+    ------
+    ConfigError
+        They are too few for a run of few workers; 80 were enough for two.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    permitted = 8192 if hard == resource.RLIM_INFINITY else min(hard, 8192)
+    if permitted < MIN_OPEN_FILES:
+        text = f"the system permits {hard} open files, a run needs {MIN_OPEN_FILES}"
+        raise ConfigError("RIL-584", text, remedy="raise the limit: ulimit -n 1024")
+    if 0 <= soft < permitted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (permitted, hard))
 
 
 def cores() -> int:

@@ -12,9 +12,6 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-ROOM = 64_000
-"""Bytes that must fit in: an empty file fits on a full disk, and into a quota that is used up."""
-
 
 @cache
 def private_folder() -> Path:
@@ -29,7 +26,8 @@ def private_folder() -> Path:
             # Looked at after it was made: a folder that somebody else prepared under this name is passed over.
             if _is_private(path):
                 with tempfile.TemporaryFile(dir=path) as file:
-                    file.write(bytes(ROOM))
+                    # An empty file fits on a full disk, and into a quota that is used up.
+                    file.write(bytes(64_000))
                 return path
         except OSError:
             continue

@@ -27,10 +27,6 @@ MALFORMED = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, Va
 """Errors of zipfile (NotImplementedError: a method that it does not know), json and the codec about what they read."""
 
 
-KEPT_OPEN = 32
-"""Archives that a process keeps open: arrays are read one by one, and opening reads the directory."""
-
-
 class BrokenError(ValueError):
     """The file of an artifact is not as it was written; the text says in which way."""
 
@@ -113,7 +109,8 @@ def opened(path: str) -> Iterator[Archive]:
         raise BrokenError(os.strerror(error.errno)) from None
 
 
-@lru_cache(KEPT_OPEN)
+# Arrays are read one by one, and opening reads the directory.
+@lru_cache(32)
 def _kept(path: str, marked: str) -> Archive:
     """The archive at a path while the file's mark stays the same; it is closed when nobody refers to it."""
     return Archive(_RegularFile(path))

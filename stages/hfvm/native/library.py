@@ -12,9 +12,6 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm.native import build
 from rille.stages.hfvm.native.problem import CANDIDATES, Field, LevelPair, Map, Smoothing
 
-LANES = 8
-"""Pixels that the C code looks at together: lists of a row have as much room beyond their end."""
-
 
 class _Pair(Structure):
     _fields_ = (
@@ -60,7 +57,8 @@ class Library:
     def propagate(self, pair: LevelPair, field: Field, smoothing: Smoothing) -> None:
         """Improve displacements in place by those of the neighbours, see ``reference.propagate``."""
         dirty = np.zeros(pair.left.shape, np.uint8)
-        room = np.empty(3 * (pair.left.shape[1] + LANES), np.int32)
+        # The C code looks at eight pixels together, also beyond the end of a row's lists.
+        room = np.empty(3 * (pair.left.shape[1] + 8), np.int32)
         here, work = [_at(a, np.int32) for a in field], (_at(dirty, np.uint8), _at(room, np.int32))
         self._call("propagate", pair, *here, (3 * c_int32)(*smoothing), *work)
 

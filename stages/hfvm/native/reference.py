@@ -28,8 +28,6 @@ TRUNCATION = 2
 COLUMNS = 8
 """Columns that are searched together."""
 
-MAX_TRIED = 2048
-"""Room for the candidates of a search: 5 centres, 17 rows, 17 columns, and the centre of each of 3 pieces again."""
 
 SUM_RADIUS = 2
 """Pixels: reach of the windows over which distances are summed."""
@@ -122,7 +120,8 @@ def search(pair, up, reach, out):  # type: ignore[no-untyped-def]
     reach : columns and rows to either side.
     """
     (rows, cols), (high, wide), (up_rows, up_cols) = pair.left.shape, pair.right.shape, up[0].shape
-    centres, tried, one = np.empty(up[0].shape, np.int32), np.empty(MAX_TRIED, np.int32), np.float32(1.0)
+    # Room for 5 centres, 17 rows, 17 columns, and the centre of each of 3 pieces again.
+    centres, tried, one = np.empty(up[0].shape, np.int32), np.empty(2048, np.int32), np.float32(1.0)
     for j in range(up_rows):
         terms = epipolar.row_terms(pair.f, 2 * j + 0.5)
         for i in range(up_cols):

@@ -35,9 +35,6 @@ from rille.stages.odometry.resection.trajectory import Chained, ChainLink, accou
 MIN_WAY_SHARE = 0.03
 """Of the chain's ways along a direction, over those along the main one, for it to tell errors along that direction."""
 
-MIN_LONGER = 0.01
-"""Change of the camera's ways by other sensors, as a share, that is worth a word."""
-
 
 def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
     """Factors from the key frame of each segment to its other frames; the sources of the calibration are the last.
@@ -181,7 +178,7 @@ def adjust_stage(
             lines.append(_left_out(given[inside[k] - len(chain.ends)], done.state.poses[ends]))
     if excess > 1.0:
         text = f"the camera's own errors are about {excess:.0f} times those stated: all covariances grow by that"
-        if abs((longer := lengths[1] / max(lengths[0], 1e-12)) - 1.0) > MIN_LONGER and sensors.used:
+        if abs((longer := lengths[1] / max(lengths[0], 1e-12)) - 1.0) > 0.01 and sensors.used:
             text += f"; by {' and '.join(f'[{name}]' for name in sensors.used)} its ways are {longer:.3f} times as long"
             text += ", elevations are not: correct the baseline, or the sensor's unit and scale"
         lines.append(text)

@@ -45,11 +45,6 @@ from rille.stages.odometry.resection.robust_pose import (
     whole,
 )
 
-MAX_STEPS = 20
-"""Steps of Levenberg-Marquardt, at most; about 5 suffice."""
-MIN_DISPARITY_SIGMA_PX = 1e-3
-"""Pixels: an exact disparity would have infinite information."""
-
 
 @dataclass(frozen=True)
 class SegmentTracks:
@@ -110,14 +105,15 @@ class SegmentAdjustment:
 
     def observations(self, f: int) -> Observations:
         """Frame ``f`` by itself, landmarks as their disparities have them."""
-        return Observations.of(
-            self.tracks.landmarks, self.tracks.pixels[f], self.tracks.camera, self.params.pixel_sigma
-        )
+        tracks = self.tracks
+        return Observations(tracks.landmarks, tracks.pixels[f], tracks.camera, self.params.pixel_sigma)
 
     def errors(self, state: SegmentState, f: int) -> Errors:
         """Back-projection errors of frame ``f``; depths are unknowns, so landmarks have no error of their own."""
-        exact = self.observations(f)._replace(sigma=np.zeros(len(state.depth)))
-        return back_projection(exact, Pose(state.R[f], state.t[f], state.depth + state.bias))
+        exact = replace(self.tracks.landmarks, sigma=np.zeros(len(state.depth)))
+        return back_projection(
+            self.observations(f)._replace(landmarks=exact), Pose(state.R[f], state.t[f], state.depth + state.bias)
+        )
 
     def weights(self, errors: Errors, f: int) -> Floats:
         """Huber's weights (n,) of frame ``f``; 0 of what is not seen there."""
@@ -180,7 +176,8 @@ class SegmentAdjustment:
 
 def adjust(tracks: SegmentTracks, start: SegmentState, params: ResectParams) -> Minimum[SegmentState]:
     """The state of least cost; never worse than its start by the same cost."""
-    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, MAX_STEPS)
+    # About 5 steps suffice.
+    return levenberg_marquardt(SegmentAdjustment(tracks, params), start, 20)
 
 
 class PosedTracks(NamedTuple):
@@ -202,7 +199,8 @@ class PosedTracks(NamedTuple):
         if not len(rows):
             return None
         landmarks = points.landmarks.take(rows)
-        landmarks = replace(landmarks, sigma=np.maximum(landmarks.sigma, MIN_DISPARITY_SIGMA_PX))
+        # An exact disparity would have infinite information.
+        landmarks = replace(landmarks, sigma=np.maximum(landmarks.sigma, 1e-3))
         pixels = np.swapaxes(points.tracks[rows][:, frames], 0, 1).astype(np.float64)
         T = [RigidTransform.from_matrix(poses[j]).inverse() for j in frames]
         state = SegmentState(
@@ -226,7 +224,7 @@ class PosedTracks(NamedTuple):
 
     def landmarks(self) -> Floats:
         """Landmarks (n, 3) in this state, m, local frame."""
-        return self.tracks.landmarks.moved(self.state.depth + self.state.bias)
+        return self.tracks.landmarks.moved(self.state.depth + self.state.bias).position
 
 
 class PoseErrors(NamedTuple):

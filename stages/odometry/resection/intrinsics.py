@@ -86,9 +86,6 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
 
-HELD_SHARE = 0.7
-"""Share of the prior's standard deviation above which a number rests on the calibration as given."""
-
 
 class IntrinsicsParams(Params):
     """Parameters of the stage ``intrinsics``."""
@@ -344,7 +341,8 @@ def intrinsics_stage(
         "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
         "covariance": (common.covariance + np.outer(common.errors, common.errors)).tolist(),
-        "held": [name for name, share in zip(names, sigma / params.sigma, strict=True) if share > HELD_SHARE],
+        # These rest on the calibration as given.
+        "held": [name for name, share in zip(names, sigma / params.sigma, strict=True) if share > 0.7],
         "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],
         "correction": correction.tolist(),
         "corrected": composed(made, correction).tolist(),

@@ -8,7 +8,7 @@ interpolation and is more exact. Coordinates are those of the local frame, with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -41,15 +41,15 @@ class Landmarks:
     position : (n, 3) in the local frame, m; NaN if a landmark has no coordinates.
     per_pixel : (n, 3) motion along the ray, away from the camera, for a change of the disparity by a pixel, m/pixel.
     sigma : (n,) standard deviation of the disparity, pixels.
-    share : (n,) change of the inverse depth for a pixel over the inverse depth, 1/pixel: 1 over the disparity of a
-        parallel rig; 0 moves landmarks in proportion to pixels.
+    inverse_parallax : (n,) 1 over the parallax, which is the disparity's difference from that of a point at infinity,
+        1/pixel; 0 moves landmarks in proportion to pixels.
     lost : number of landmarks without coordinates, by reason.
     """
 
     position: Floats
     per_pixel: Floats
     sigma: Floats
-    share: Floats | float = 0.0
+    inverse_parallax: Floats
     lost: dict[str, int] = field(default_factory=dict)
 
     def summary(self) -> str:
@@ -58,22 +58,23 @@ class Landmarks:
 
     def take(self, which: NDArray[np.intp]) -> Landmarks:
         """Some of them."""
-        share = np.broadcast_to(self.share, self.sigma.shape)[which]
-        return Landmarks(self.position[which], self.per_pixel[which], self.sigma[which], share, self.lost)
+        arrays = self.position[which], self.per_pixel[which], self.sigma[which], self.inverse_parallax[which]
+        return Landmarks(*arrays, self.lost)
 
-    def moved(self, pixels: Floats) -> Floats:
-        """Coordinates (n, 3) for disparities that are larger by ``pixels`` (n,)."""
-        return self.position + (pixels * nearness(self.share, pixels))[:, None] * self.per_pixel
+    def moved(self, pixels: Floats | float) -> Landmarks:
+        """Landmarks whose disparities are larger by ``pixels``, of all or (n,).
 
-
-def nearness(share: Floats | float, pixels: Floats | float) -> Floats:
-    """Inverse depths before over those after a change of the disparities by ``pixels``.
-
-    Disparities are linear in inverse depths, not in depths: a depth that is linear in the disparity makes errors of
-    disparities smaller where the whole scene is nearer, so an adjustment would pull scenes of one depth towards the
-    camera, and shorten the path. Farther than ten times as far nothing is moved: infinity lies there.
-    """
-    return np.asarray(1.0 / np.maximum(1.0 - np.asarray(share) * pixels, 0.1))
+        Disparities are linear in inverse depths, not in depths: a depth that is linear in the disparity makes errors of
+        disparities smaller where the whole scene is nearer, so an adjustment would pull scenes of one depth towards the
+        camera, and shorten the path. Farther than ten times as far nothing is moved: infinity lies there.
+        """
+        farther = 1.0 / np.maximum(1.0 - self.inverse_parallax * pixels, 0.1)
+        return replace(
+            self,
+            position=self.position + (pixels * farther)[:, None] * self.per_pixel,
+            per_pixel=self.per_pixel * farther[:, None] ** 2,
+            inverse_parallax=self.inverse_parallax * farther,
+        )
 
 
 class SegmentPoints(NamedTuple):
@@ -122,7 +123,7 @@ def landmarks_of(
         "too far for the baseline": int((smooth & ~near).sum()),
     }
     position, per_pixel = (np.where(near[:, None], a, np.nan) for a in (landmarks.position, landmarks.per_pixel))
-    return Landmarks(position, per_pixel, np.where(near, sigma, np.nan), landmarks.share, lost)
+    return replace(landmarks, position=position, per_pixel=per_pixel, sigma=np.where(near, sigma, np.nan), lost=lost)
 
 
 def triangulated(points: Floats, right: Floats, rig: Rig, T_local_left: RigidTransform, sigma: Floats) -> Landmarks:

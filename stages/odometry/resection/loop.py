@@ -27,21 +27,15 @@ from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_of
 from rille.stages.odometry.resection.robust_pose import Resection, ResectParams, resect
 from rille.stages.odometry.resection.trajectory import propagation
 
-MIN_MATCHES = 30
-"""Matches of features below which two images are not said to be alike."""
 MIN_INLIERS, MIN_INLIER_SHARE = 20, 0.4
 """Landmarks that agree with one pose, and their share of those that match."""
 MIN_BLOCKS, BLOCKS = 5, 4
 """Parts of either image, of 4 x 4, in which landmarks agree."""
 MAX_DEPTH_RATIO = 1.1
 """Median ratio of a point's depths by both pairs, either way."""
-MAX_DEPARTURE = 4.0
-"""Standard deviations by which the poses of both directions may depart from each other."""
 FEATURE_SIGMA = 0.35
 """Standard deviation of a matched feature's position, in pixels of the image in which features are detected. A track's
 0.2 pixels of the full image gave near landmarks too much weight, and errors twice those stated (flight of EuRoC)."""
-MAX_FEATURE_SIGMAS = 4.0
-"""Back-projection error of a landmark that agrees."""
 HERE = RigidTransform.identity()
 
 
@@ -91,7 +85,7 @@ def loop_between(a: Features, b: Features, matches: NDArray[np.uint32], seed: in
     off = np.concatenate([around.translation, rotation_log(around.rotation)])
     both = lever @ there.total @ lever.T + turn @ back.total @ turn.T
     excess = float(off @ np.linalg.solve(both, off)) / 6.0
-    if excess > MAX_DEPARTURE**2:
+    if excess > 4.0**2:
         raise NoLoopError(f"the poses of both directions depart by {np.linalg.norm(off[:3]):.2g} m")
     share = there.total @ lever.T @ np.linalg.solve(both, off)
     T = RigidTransform(rotation_exp(-share[3:]) @ T_a_b.rotation, T_a_b.translation - share[:3])
@@ -103,7 +97,7 @@ def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> 
     """Pose of the second camera by landmarks of the first, and the matches (k, 2) that have one."""
     known = matches[np.isfinite(a.landmarks.position[matches[:, 0], 0])]
     sigma = FEATURE_SIGMA * detected_pixel(b.camera.width, b.camera.height)
-    params = ResectParams.model_validate({"pixel_sigma": sigma, "threshold": MAX_FEATURE_SIGMAS * sigma})
+    params = ResectParams.model_validate({"pixel_sigma": sigma, "threshold": 4.0 * sigma})
     try:
         posed = resect(a.landmarks.take(known[:, 0]), b.points[known[:, 1]], b.camera, [HERE], params, seed)
     except DegenerateError as error:
@@ -175,7 +169,7 @@ def loop_stage(
     for k, pair in enumerate(pairs[1:], start=1):
         # Descriptors first: most candidates match so little that their disparities need not be read.
         matches = match(*(np.asarray(features[j]["descriptors"], np.float32) for j in (k, 0)))
-        if len(matches) < MIN_MATCHES:
+        if len(matches) < 30:
             continue
         ends = {"from": pair, "to": pairs[0]}
         try:

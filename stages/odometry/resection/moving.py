@@ -23,14 +23,8 @@ from rille.stages.odometry.resection.landmarks import triangulated
 
 DISPARITY_SIGMA_PX = 0.3
 """Standard deviation of a disparity [pixels of the coarser image], with what a coarse pixel holds of relief."""
-SIGMAS = 3.0
-"""Times that by which a place may be off."""
 MIN_DEPARTURE_PX = 1.5
 """Departure of a displacement from that of the still scene, in pixels of its level, from which on something moved."""
-MIN_SHARE = 0.002
-"""Share of the image that a moving part has at least; smaller ones are errors."""
-GROWN = 2
-"""Coarse pixels by which a moving part is widened: its border is blurred by the windows of the matcher."""
 
 
 class MovingParams(Params):
@@ -67,7 +61,7 @@ def departures(
     # From a pair of image b the still scene leads to its place in a, whose displacement must lead back.
     measured = _at(shift, (there + 0.5) / scale - 0.5) if back else shift.reshape(-1, 2)
     off = np.linalg.norm(there + measured - here if back else here + measured - there, axis=1)
-    return np.asarray((off - SIGMAS * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
+    return np.asarray((off - 3.0 * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
 
 
 def _disparities(disparity: Bundle, pixels: NDArray[np.intp]) -> Floats:
@@ -92,9 +86,10 @@ def moving(off: Floats) -> Bools:
     # Single rows and corners are errors of the displacements; what is left after opening is a surface.
     opened = cv2.morphologyEx(departs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_SHARE * off.size]
-    side = 2 * GROWN + 1
-    return np.asarray(cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((side, side), np.uint8)) != 0)
+    # Smaller parts are errors.
+    large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= 0.002 * off.size]
+    # The windows of the matcher blur the border of what moves.
+    return np.asarray(cv2.dilate(np.isin(labels, large).astype(np.uint8), np.ones((5, 5), np.uint8)) != 0)
 
 
 @stage(

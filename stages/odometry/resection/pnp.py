@@ -25,37 +25,33 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, Pinhole, linearise, perturbed, rotated
 from rille.stages.numeric.robust import huber_weight
-from rille.stages.odometry.resection.landmarks import Landmarks, nearness
+from rille.stages.odometry.resection.landmarks import Landmarks
 
 HUBER = 2.5
 """Huber's bound in standard deviations: 4 % of Gaussian errors in two dimensions lie beyond it."""
 
 
 class Observations(NamedTuple):
-    """Landmarks as one frame observes them.
+    """Landmarks as a camera observes them.
 
-    ``landmarks`` (n, 3) in the local frame, m; ``per_pixel`` (n, 3) motion of a landmark for a change of its disparity
-    by a pixel, m/pixel; ``sigma`` (n,) standard deviation of the disparity, pixels; ``share`` (n,) as that of
-    :class:`Landmarks`; ``pixels`` (n, 2) observed column and row; ``pixel_sigma`` standard deviation of these, pixels.
+    ``pixels`` (n, 2) column and row; ``pixel_sigma`` their standard deviation, pixels.
     """
 
-    landmarks: Floats
+    landmarks: Landmarks
+    pixels: Floats
+    camera: Camera
+    pixel_sigma: float
+
+
+class _Seen(NamedTuple):
+    """The same for the kernel, landmarks moved by the bias."""
+
+    position: Floats
     per_pixel: Floats
     sigma: Floats
-    share: Floats
     pixels: Floats
     camera: Pinhole
     pixel_sigma: float
-
-    @staticmethod
-    def of(landmarks: Landmarks, pixels: Floats, camera: Camera, pixel_sigma: float) -> Observations:
-        """Landmarks as a camera observes them at ``pixels`` (n, 2)."""
-        share = np.broadcast_to(landmarks.share, landmarks.sigma.shape)
-        position, per_pixel, sigma, share, seen = (
-            np.ascontiguousarray(a, dtype=np.float64)
-            for a in (landmarks.position, landmarks.per_pixel, landmarks.sigma, share, pixels)
-        )
-        return Observations(position, per_pixel, sigma, share, seen, Pinhole.of(camera), pixel_sigma)
 
 
 class Pose(NamedTuple):
@@ -90,31 +86,33 @@ class Errors(NamedTuple):
 def back_projection(obs: Observations, pose: Pose) -> Errors:
     """Eq. 7 and 8 at a pose, linearised."""
     whitened, lengths = np.zeros((len(obs.pixels), 2, 8)), np.empty((len(obs.pixels), 3))
-    near = nearness(obs.share, pose.bias)
-    landmarks = obs.landmarks + (pose.bias * near)[:, None] * obs.per_pixel
-    moved = obs._replace(landmarks=landmarks, per_pixel=obs.per_pixel * near[:, None] ** 2)
-    _linearised(moved, pose.R, pose.t, whitened, lengths)
+    at = obs.landmarks.moved(pose.bias)
+    position, per_pixel, sigma, pixels = (
+        np.ascontiguousarray(a, np.float64) for a in (at.position, at.per_pixel, at.sigma, obs.pixels)
+    )
+    seen = _Seen(position, per_pixel, sigma, pixels, Pinhole.of(obs.camera), obs.pixel_sigma)
+    _linearised(seen, pose.R, pose.t, whitened, lengths)
     return Errors(whitened[..., :7], whitened[..., 7], *lengths.T)
 
 
 @njit(cache=True, nogil=True)
-def _linearised(obs, R, t, whitened, lengths):  # type: ignore[no-untyped-def]
+def _linearised(seen, R, t, whitened, lengths):  # type: ignore[no-untyped-def]
     """Fill ``whitened`` (n, 2, 8): Jacobian and error; ``lengths`` (n, 3): whitened, in pixels, stretch."""
-    sigma = obs.pixel_sigma
+    sigma = seen.pixel_sigma
     for n in range(len(lengths)):
-        x, y, z = rotated(R, obs.landmarks[n])
+        x, y, z = rotated(R, seen.position[n])
         x, y, z = x + t[0], y + t[1], z + t[2]
         # Also where a coordinate is NaN: not seen, or no landmark.
-        if not (z >= NEAREST_M and abs(obs.pixels[n, 0] + obs.pixels[n, 1]) < np.inf):
+        if not (z >= NEAREST_M and abs(seen.pixels[n, 0] + seen.pixels[n, 1]) < np.inf):
             lengths[n] = np.inf
             continue
         j = whitened[n]
-        linearise(obs.camera, (x, y, z), rotated(R, obs.per_pixel[n]), obs.pixels[n], j)
+        linearise(seen.camera, (x, y, z), rotated(R, seen.per_pixel[n]), seen.pixels[n], j)
         lengths[n, 1] = np.hypot(j[0, 7], j[1, 7])
         # S^-1/2: along g divide by the longer standard deviation.
         size = np.hypot(j[0, 6], j[1, 6])
         eu, ev = (j[0, 6] / size, j[1, 6] / size) if size > 0.0 else (1.0, 0.0)
-        longer = np.hypot(sigma, size * obs.sigma[n])
+        longer = np.hypot(sigma, size * seen.sigma[n])
         for k in range(8):
             excess = (1.0 / sigma - 1.0 / longer) * (eu * j[0, k] + ev * j[1, k])
             j[0, k], j[1, k] = j[0, k] / sigma - eu * excess, j[1, k] / sigma - ev * excess

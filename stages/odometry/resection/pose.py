@@ -23,9 +23,6 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, POSES, REFERENCE_PLANE
 
-MAX_MOVE_CELLS = 0.25
-"""Cells that a model may lie off its adjusted place."""
-
 
 def greatest_move(before: RigidTransform, after: RigidTransform, local: DemFacts) -> float:
     """Cells by which the farthest corner of an elevation model moves in the world with its camera's pose."""
@@ -57,7 +54,8 @@ def pose_stage(
     used = trajectory
     if chained is not None and local is not None:
         before, after = (RigidTransform.from_matrix(one["poses"][row]) for one in (chained, trajectory))
-        used = chained if greatest_move(before, after, local.meta) <= MAX_MOVE_CELLS else trajectory
+        # A model may lie a quarter of a cell off its adjusted place.
+        used = chained if greatest_move(before, after, local.meta) <= 0.25 else trajectory
     arrays = {name: used[name][row : row + 1].copy() for name in ("poses", "covariance") if name in used.arrays}
     # Of another trajectory than that of the segments nothing says what the calibration has to do with it.
     if "own_covariance" in used.arrays:

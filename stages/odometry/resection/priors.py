@@ -32,8 +32,6 @@ from rille.stages.odometry.resection.sensors import (
 
 MAX_SIGMA_SHARE = 0.1
 """Of the standard deviation that a clock's offset had before, up to which it is determined."""
-MIN_LATE_S = 0.005
-"""Offset of a clock that is not worth a word."""
 MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
 MIN_LEAN = math.radians(0.05)
@@ -217,7 +215,7 @@ class Sensors:
             }
             if not clock.determined:
                 self.lines.append(f"[{name}] the offset of its clock is not determined: the motion changes too little")
-            elif abs(clock.late) > max(MIN_SIGMAS * clock.sigma, MIN_LATE_S):
+            elif abs(clock.late) > max(MIN_SIGMAS * clock.sigma, 0.005):
                 self.lines.append(
                     f"[{name}] its times are {clock.late:.3f} s late (standard deviation {clock.sigma:.3f} s), which "
                     f"is taken into account: add {-clock.late:.3f} to its time_offset"

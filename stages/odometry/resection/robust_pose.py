@@ -37,6 +37,7 @@ from rille.stages.core.declare import Params
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera, RigidTransform
+from rille.stages.geometry.projection import Pinhole
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import MAX_RELATIVE_SIGMA, Landmarks
 from rille.stages.odometry.resection.pnp import (
@@ -53,18 +54,12 @@ from rille.stages.odometry.resection.pnp import (
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-MAX_BLOCKS = 6
-"""Blocks along either side of the image whose mean errors show how far neighbours' errors go together."""
-MIN_PER_BLOCK = 6
-"""Mean number of landmarks in a block, at least."""
 MAX_STEPS = 50
 """Steps of Levenberg-Marquardt, at most; about 10 suffice."""
 SEED = 1999 * 100_003
 """Seed of the random samples, to which the frame's number is added."""
 SHARED_SOURCES = 7
 """Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
-REMOVED_SHARE = 8
-"""Per iteration, the worst ceil(n / 8) of n landmarks above the threshold are removed; then the pose is adjusted."""
 SEARCHED_PX = 9.0
 """Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
 THRESHOLD_SHARES = (0.25, 0.5, 1.0)
@@ -159,14 +154,14 @@ def resect(
     count = f"{where}: too few landmarks: {len(pixels)} have coordinates and were found ({landmarks.summary()})"
     enough(len(pixels), count, "set track.points higher or choose basic pairs closer")
     _not_collinear(landmarks.position, where)
-    obs = Observations.of(landmarks, pixels, camera, params.pixel_sigma)
+    obs = Observations(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]
     pose, near = _robust_start(obs, predictions, params, frame)
     pose, active = _without_inconsistent(obs, pose, near, params, where)
     errors = back_projection(obs, pose)
     _not_by_chance(errors, params, where)
     _not_collinear(landmarks.position[active], where)
-    depth = float(np.median(obs.landmarks[active] @ pose.R[2] + pose.t[2]))
+    depth = float(np.median(obs.landmarks.position[active] @ pose.R[2] + pose.t[2]))
     normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
     measured, stated = _certainty(errors, normal, depth, params, where)
     covariance, shared = frame_errors(measured, stated, pose.R, depth)
@@ -209,8 +204,8 @@ def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % 2**31
     # The size plays no part, but must be there.
-    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(obs.camera))
-    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks, camera, options)
+    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(Pinhole.of(obs.camera)))
+    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks.position, camera, options)
     return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
 
 
@@ -237,7 +232,7 @@ def _without_inconsistent(
             return pose, active
         active = active.copy()
         # Not all of them at once: the worst pull the pose, and others agree once these are gone.
-        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / REMOVED_SHARE)]] = False
+        active[np.argsort(-norm, kind="stable")[: math.ceil(beyond / 8)]] = False
 
 
 def _first_order(obs: Observations, pose: Pose) -> Bools:
@@ -246,8 +241,9 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
     A camera that has come close to a landmark, or passed it, sees its error along the old ray at any size: such a
     landmark agrees with everything, thousands of pixels off.
     """
-    depth = obs.landmarks @ pose.R[2] + pose.t[2]
-    return np.asarray(obs.sigma * np.sqrt((obs.per_pixel**2).sum(1)) <= MAX_RELATIVE_SIGMA * depth)
+    depth = obs.landmarks.position @ pose.R[2] + pose.t[2]
+    spread = obs.landmarks.sigma * np.linalg.norm(obs.landmarks.per_pixel, axis=1)
+    return np.asarray(spread <= MAX_RELATIVE_SIGMA * depth)
 
 
 def _certainty(
@@ -305,7 +301,8 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     pose less well than as many independent ones. ``white`` (n, 2): whitened errors after adjustment, at ``pixels``
     (n, 2), with ``weight`` (n,). The six unknowns of the pose take up as many degrees of freedom of the means.
     """
-    side = min(MAX_BLOCKS, int(math.sqrt(len(pixels) / MIN_PER_BLOCK)))
+    # At most 6 x 6 blocks, of six landmarks on average at least.
+    side = min(6, int(math.sqrt(len(pixels) / 6)))
     if side < 3:
         return 1.0
     col = np.clip(pixels[:, 0] * side / camera.width, 0, side - 1).astype(np.intp)

@@ -29,24 +29,16 @@ LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
-MIN_STEP_SHARE = 0.05
-"""Of the median step that is one: dead reckoning at rest is not exact."""
 VERTICAL_SIGMA = math.radians(5.0)
 """Of the world's vertical against that of the place: a plane of ground is a slope."""
 MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
-MAX_GAP_STEPS = 3.0
-"""Median steps of the camera over which its way is interpolated to the time of a position."""
-WINDOWS = 16
-"""Parts of a trajectory over which ways are compared: over single frames noise would hide a turned mount."""
 CAMERA_SHARE = 0.05
 """Error of the camera's own ways that no sensor is doubted for."""
 MIN_TURN = math.radians(1.0)
 """RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
 MIN_WAY_NOISES = 3.0
 """Noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean nothing."""
-HELD = 0.02
-"""Weight of the identity against the data where Q is sought: along a straight way a roll does not show."""
 MIN_SIGMAS = 3.0
 """Standard deviations from which on a departure is one of the whole sensor."""
 
@@ -122,7 +114,8 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
     off = math.sqrt(float(((own - said) ** 2).sum())) / max(size, 1e-12)
     if off <= allowed:
         return off, ""
-    u, _, vt = np.linalg.svd(own.T @ said / (own**2).sum() + HELD * np.eye(3))
+    # The identity weighs a little: along a straight way a roll does not show.
+    u, _, vt = np.linalg.svd(own.T @ said / (own**2).sum() + 0.02 * np.eye(3))
     Q = u @ vt
     turned = said @ Q.T
     scale = float((own * turned).sum() / max((turned**2).sum(), 1e-12))
@@ -186,7 +179,8 @@ class RelativePrior:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
         sensed = self._at(own.rows, shift)
         rows = np.flatnonzero(np.isfinite(sensed).all((1, 2)))
-        lag = max(len(rows) // WINDOWS, 1)
+        # Over single frames noise would hide a turned mount.
+        lag = max(len(rows) // 16, 1)
         a, b = rows[:-lag], rows[lag:]
         same = own.piece[a] == own.piece[b]
         a, b = a[same], b[same]
@@ -225,7 +219,8 @@ class RelativePrior:
         if not self.drift:
             sigma, shared = np.full((count, 3), self.turn), OFFSET_SIGMA_S * clock[:, :, None]
         else:
-            step = np.maximum(way, MIN_STEP_SHARE * np.median(way[way > 0]) if count else 0.0)[:, None]
+            # Dead reckoning at rest is not exact.
+            step = np.maximum(way, 0.05 * np.median(way[way > 0]) if count else 0.0)[:, None]
             sigma, used = np.repeat(step * [self.drift, self.turn], 3, axis=1), slice(0, 6)
             scale = np.concatenate([self.drift * measured[:, :, 3], np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)
@@ -279,7 +274,8 @@ class PositionPrior:
         length = own.times[after] - own.times[after - 1]
         part = (at - own.times[after - 1]) / length
         near = np.where(part < 0.5, after - 1, after)
-        usable = length <= MAX_GAP_STEPS * np.median(np.diff(own.times))
+        # Not over gaps of several frames.
+        usable = length <= 3.0 * np.median(np.diff(own.times))
         usable &= (own.piece[after] == own.piece[after - 1]) & (part > -0.5) & (part < 1.5)
         velocity = (antenna[after] - antenna[after - 1]) / length[:, None]
         # The antenna is moved, not the position: how the frame of positions is turned is not known yet.

@@ -25,8 +25,6 @@ SECOND_SHARE = 0.2
 """Share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less."""
 BODY_SHARE = 0.1
 """The same where the landmarks that do not move in the image are all nearer, as the vehicle's own body is."""
-STILL_PX = 0.5
-"""Median displacement [pixels] below which landmarks do not move in the image."""
 BESIDE_SHARE = 0.5
 """Share of its landmarks that the scene has in columns of the image beside what moves; with a lorry before the camera
 0.7 to 0.9, of parts that lie about alike 0.1."""
@@ -69,7 +67,7 @@ def moving_by_themselves(
     seen = points.known()[:, 1 : j + 1] & trusted[:, None]
     total, use = int(seen.any(1).sum()), np.flatnonzero(seen[:, -1])
     known, pixels = points.landmarks.take(use), points.tracks[use, j].astype(np.float64)
-    observed = Observations.of(known, pixels, camera, params.pixel_sigma)
+    observed = Observations(known, pixels, camera, params.pixel_sigma)
 
     def contradict(pose: Resection) -> Bools:
         errors = back_projection(observed, Pose.of(pose.T_local_left.inverse()))
@@ -90,7 +88,7 @@ def moving_by_themselves(
         return left[:0]
     parts = [_Part(at, pixels[at], before[at, 2], pose) for at, pose in zip(rows, (posed, other), strict=True)]
     still, moving = sorted(parts, key=lambda part: float(np.median(shift[part.rows])))
-    stays = bool(np.median(shift[still.rows]) < STILL_PX)
+    stays = bool(np.median(shift[still.rows]) < 0.5)
     body = stays and bool(np.quantile(still.depth, 0.9) < np.quantile(moving.depth, 0.1))
     for scene, rest in (parts, parts[::-1]):
         alone = rest.rows[contradict(scene.pose)[rest.rows]]

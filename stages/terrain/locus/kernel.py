@@ -29,8 +29,6 @@ from numba import njit
 from rille.stages.core.arrays import Floats, Floats32
 
 MIN_DEPTH_M = 1e-9  # metres, projective depth: excludes the camera's own plane
-SEARCH_STEP_PX = 1.0  # search step: disparity is bilinear between pixels, so nothing hides in a shorter one
-MAX_STEPS = 4096.0  # of one locus: more than the diagonal of a 12 megapixel image
 MARGIN_STEPS = 1.0  # that the interval handed down from the coarse level is widened by
 SOLVED_PX = 1e-3  # |s| of a solution: a two-hundredth of the disparity's usual noise
 
@@ -229,7 +227,9 @@ def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
     """:class:`SearchSteps` of a cell on the visible ``span`` of Z, from the interval ``start``, both (low, high)."""
     bottom, top = span
     speed = math.sqrt(max(fastest(lines.left, span), fastest(lines.right, span)))
-    count = max(1.0, min(np.ceil(speed * (top - bottom) / SEARCH_STEP_PX), MAX_STEPS))
+    # Steps of a pixel: disparity is bilinear between pixels, so nothing hides in shorter ones. 4096 are more than the
+    # diagonal of a 12 megapixel image.
+    count = max(1.0, min(np.ceil(speed * (top - bottom)), 4096.0))
     dz = (top - bottom) / count
     first = max(0.0, min(count, np.ceil((start[1] - bottom) / dz) + MARGIN_STEPS))
     return SearchSteps(bottom, dz, int(count), int(first), np.floor((start[0] - bottom) / dz) - MARGIN_STEPS)

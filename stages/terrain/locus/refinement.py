@@ -29,8 +29,6 @@ BEND_STIFFNESS = 4000.0
 from 2000 to 16000."""
 MAX_BEND_PX = 0.05
 """Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
-MAX_CHANGE_PX = 1.0
-"""Largest total change [pixels of disparity] of a cell: beyond it, the images match at another place."""
 
 MEAN_SIDE_CELLS = 15
 """Side [cells] of the window of the local mean; brightness varies more slowly."""
@@ -59,8 +57,9 @@ def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: in
         slope = np.where(keep, seen.right_slope - seen.left_slope, np.float32(0.0))
         bends = bend_weights(z, seen.scale, MAX_BEND_PX, BEND_STIFFNESS)
         moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, sweeps=20)
-        # About the start, not the last step: many small steps could otherwise wander to another likeness.
-        reach = MAX_CHANGE_PX / seen.scale
+        # About the start, not the last step: many small steps could otherwise wander to another likeness. Beyond a
+        # pixel of disparity the images match at another place.
+        reach = 1.0 / seen.scale
         z = np.where(keep, np.clip(moved, elevation - reach, elevation + reach), elevation)
         seen = look(views, lattice, z)
         _level(seen, gain)

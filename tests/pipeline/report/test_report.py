@@ -19,6 +19,7 @@ from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
 from rille.pipeline.report import canvas, figures, gather, metrics, ranges, strips, words
 from rille.pipeline.report.delivery import is_complete
+from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
@@ -314,7 +315,12 @@ def test_a_failed_write_leaves_the_old_page(tmp_path: Path, monkeypatch: pytest.
     ],
 )
 def test_numbers_have_sensible_digits(value: Any, unit: str, text: str) -> None:
-    assert words.quantity(value, unit) == text
+    assert quantities.quantity(value, unit) == text
+
+
+def test_signed_lengths_have_a_plus_where_they_are_positive() -> None:
+    lengths = 0.0123, -0.0123, 3.1e-17, None, np.nan
+    assert [quantities.metres(v, signed=True) for v in lengths] == ["+12.3 mm", "−12.3 mm", "0 m", "–", "–"]
 
 
 def test_limits_are_robust_and_never_empty() -> None:
@@ -400,4 +406,4 @@ def test_both_cameras_are_told_where_they_differ(tmp_path: Path) -> None:
 
 
 def test_a_gap_is_a_dash_in_words() -> None:
-    assert [words.number(np.nan), words.metres(np.nan), words.metres(None)] == ["–"] * 3
+    assert [quantities.number(np.nan), quantities.metres(np.nan), quantities.metres(None)] == ["–"] * 3

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from toys.finished import Page, bundles, view, written
 
 from rille.pipeline.export.view import UNSTATED, TaskRow
-from rille.pipeline.report import delivery, page, summary, terrain_map, words
+from rille.pipeline.report import delivery, page, summary, terrain_map
 from rille.pipeline.report.gather import WorldTerrain
+from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -50,7 +51,7 @@ def test_tiles_say_what_stands_beside_their_figure():
     }
     text = page_of(metrics=metrics)
     opening = text[text.index("Frames with a pose") : text.index("Nothing is missing")]
-    limit = words.number(Vehicle().max_slope_deg)
+    limit = quantities.number(Vehicle().max_slope_deg)
     figures = ("9 of 10 frames", "0.840 %", "0.500 m", "59.9 m", "against truth", "66.6 m", f"6.20° of {limit}°")
     assert [figure for figure in figures if figure not in opening] == []
     assert "Mapped area" not in opening

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from raising import raises
 
+from rille.pipeline.engine.runtime import environment
 from rille.pipeline.runs import session
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
@@ -67,11 +68,11 @@ def test_the_command_of_a_run_is_one_line_that_a_shell_takes(tmp_path):
 
 def test_too_few_open_files_are_named_before_anything_is_read(monkeypatch):
     asked = []
-    monkeypatch.setattr(session.resource, "getrlimit", lambda _: (24, 24))
-    monkeypatch.setattr(session.resource, "setrlimit", lambda _, limits: asked.append(limits))
+    monkeypatch.setattr(environment.resource, "getrlimit", lambda _: (24, 24))
+    monkeypatch.setattr(environment.resource, "setrlimit", lambda _, limits: asked.append(limits))
     with raises("RIL-584", "24 open files", "ulimit -n"):
         session.perform("no-such-sequence", session.Options())
-    monkeypatch.setattr(session.resource, "getrlimit", lambda _: (256, 100_000))
+    monkeypatch.setattr(environment.resource, "getrlimit", lambda _: (256, 100_000))
     with raises("RIL-276"):
         session.perform("no-such-sequence", session.Options())
     assert asked == [(8192, 100_000)]

@@ -244,7 +244,7 @@ def test_errors_that_the_truth_states_are_not_held_against_the_claims() -> None:
         measured = true.copy()
         measured[:, :, :3] = rotation_exp(errors[:, 3:]) @ true[:, :, :3]
         measured[:, :, 3] += errors[:, :3]
-        figures = trajectory_accuracy(true, measured, np.tile(1e-12 * np.eye(6), (20, 1, 1)), (shift, turn))[1]
+        figures = trajectory_accuracy(true, measured, np.tile(1e-12 * np.eye(6), (20, 1, 1)), shift, turn)[1]
         values.append([figures[name]["value"] for name in ("nees", "nees_position", "nees_rotation")])
         assert "0.02 m and 0.114592 degrees" in figures["nees"]["how"]
     np.testing.assert_allclose(np.mean(values, axis=0), 1.0, atol=0.1)
@@ -264,7 +264,7 @@ def test_why_claims_are_not_judged_is_said() -> None:
     singular[3, 5, 5] = 0.0
     assert "the first posed frame" in nees(poses, late, claimed)["nees"]
     assert "the first posed frame" in nees(poses[:1], poses[:1], claimed[:1])["nees"]
-    figure = trajectory_accuracy(poses, late, claimed, (0.1, 0.01))[1]["nees"]
+    figure = trajectory_accuracy(poses, late, claimed, 0.1, 0.01)[1]["nees"]
     assert figure["value"] is None
     assert "the first posed frame" in figure["how"]
     assert "singular" in nees(poses, poses, singular)["nees"]

@@ -41,7 +41,7 @@ def scene(seed, n=150, frames=4, bias=0.0, noise=0.2):
         for k in range(1, frames)
     ]
     pixels = np.array([CAMERA.project(P.apply(X)) for P in T]) + noise * rng.standard_normal((frames - 1, n, 2))
-    known = Landmarks(X - (error + bias)[:, None] * per_pixel, per_pixel, np.full(n, noise))
+    known = Landmarks(X - (error + bias)[:, None] * per_pixel, per_pixel, np.full(n, noise), np.zeros(n))
     views = SegmentTracks(known, pixels, np.ones((frames - 1, n), bool), CAMERA)
     start = [P @ RigidTransform(rotation_exp(1e-4 * rng.standard_normal(3)), 3e-3 * rng.standard_normal(3)) for P in T]
     return (
@@ -214,9 +214,8 @@ def posed_segment():
     X = CAMERA.rays(key) * 4.0
     tracks = np.stack([CAMERA.project(X - [0.0, 0.0, 0.1 * j]) for j in range(3)], 1).astype(np.float32)
     # Along the ray by Z^2 / (f B) a pixel.
-    known = Landmarks(
-        np.where(np.arange(80)[:, None] < 79, X, np.nan), CAMERA.rays(key) * 4.0**2 / (500.0 * 0.2), np.full(80, 0.2)
-    )
+    position, per_pixel = np.where(np.arange(80)[:, None] < 79, X, np.nan), CAMERA.rays(key) * 4.0**2 / (500.0 * 0.2)
+    known = Landmarks(position, per_pixel, np.full(80, 0.2), np.zeros(80))
     points = SegmentPoints(tracks, known, CAMERA, RigidTransform.identity())
     segment = SegmentPoses.unposed(points)
     segment.poses[:] = [np.hstack([np.eye(3), [[0.0], [0.0], [0.1 * j + 0.002 * (j > 0)]]]) for j in range(3)]

@@ -56,7 +56,9 @@ def test_a_pixel_of_disparity_moves_a_landmark_by_z_squared_over_f_b():
     np.testing.assert_allclose(found.per_pixel[0], CAMERA.rays(point)[0] * 2.0**2 / (400 * 0.1), rtol=1e-9)
     assert found.sigma[0] == pytest.approx(0.25)
     shifted = from_disparity(point, (d + 3.0, zero, valid), rig, level, 0.25)
-    np.testing.assert_allclose(found.moved(np.array([3.0])), shifted.position, rtol=1e-6)
+    np.testing.assert_allclose(found.moved(3.0).position, shifted.position, rtol=1e-6)
+    np.testing.assert_allclose(found.moved(3.0).per_pixel, shifted.per_pixel, rtol=1e-6)
+    np.testing.assert_allclose(found.moved(3.0).inverse_parallax, shifted.inverse_parallax, rtol=1e-6)
     far = from_disparity(point, (d, zero, valid), rig, level, 5.0)
     assert np.isnan(far.position).all()
     assert far.lost["too far for the baseline"] == 1

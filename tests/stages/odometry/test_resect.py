@@ -18,7 +18,7 @@ from rille.stages.geometry.geometry import (
     RigidTransform,
     rotation_exp,
 )
-from rille.stages.geometry.projection import Pinhole, perturbed
+from rille.stages.geometry.projection import perturbed
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
@@ -43,22 +43,27 @@ def seen(T_local_left, landmarks):
     return CAMERA.project(T_local_left.inverse().apply(landmarks))
 
 
+def exact(landmarks):
+    """Landmarks without errors, which their disparities do not move."""
+    return Landmarks(landmarks, np.zeros_like(landmarks), *np.zeros((2, len(landmarks))))
+
+
 def solve(landmarks, pixels, *, per_pixel=None, sigma=0.0, params=PARAMS, seed=0):
     """Resect from the identity; landmarks are exact unless told how they move with their disparity."""
     per_pixel = np.zeros_like(landmarks) if per_pixel is None else per_pixel
-    known = Landmarks(landmarks, per_pixel, np.broadcast_to(sigma, len(landmarks)).astype(float))
+    known = replace(exact(landmarks), per_pixel=per_pixel, sigma=np.broadcast_to(sigma, len(landmarks)).astype(float))
     return resect(known, pixels, CAMERA, [RigidTransform.identity()], params.model_copy(update={"seed": seed}), 7)
 
 
-def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2, share=0.0):
+def observed(landmarks, per_pixel, sigma, pixels, pixel_sigma=0.2, inverse_parallax=0.0):
     """Observations by the camera of these tests."""
-    shares = np.full(len(sigma), share)
-    return Observations(landmarks, per_pixel, sigma, shares, pixels, Pinhole.of(CAMERA), pixel_sigma)
+    known = Landmarks(landmarks, per_pixel, sigma, np.full(len(sigma), inverse_parallax))
+    return Observations(known, pixels, CAMERA, pixel_sigma)
 
 
 def segment_poses(points, landmarks, key, frames):
     """Points of a segment, whose landmarks are exact, and its poses."""
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)), lost={"too far": 3})
+    known = replace(exact(landmarks), lost={"too far": 3})
     given = SegmentPoints(points, known, CAMERA, key)
     return given, resect_segment(given, frames, PARAMS)
 
@@ -81,22 +86,22 @@ def test_projection_is_eq_4_with_t_the_translation_and_the_position_minus_rt_t()
     np.testing.assert_allclose(angles_from_rotation(found.T_local_left.rotation.T), (omega, phi, kappa), atol=1e-9)
 
 
-@pytest.mark.parametrize("share", [0.0, 2.0])
-def test_jacobian_against_central_differences(share):
+@pytest.mark.parametrize("inverse_parallax", [0.0, 2.0])
+def test_jacobian_against_central_differences(inverse_parallax):
     rng = np.random.default_rng(1)
     landmarks = scene(rng, 5)
     per_pixel = 0.1 * landmarks * rng.uniform(0.5, 2.0, (5, 1))
     sigma = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
     T = true_pose(rng).inverse()
     pixels = rng.uniform(0, 500, (5, 2))
-    obs = observed(landmarks, per_pixel, sigma, pixels, 0.3, share)
+    obs = observed(landmarks, per_pixel, sigma, pixels, 0.3, inverse_parallax)
     errors = back_projection(obs, Pose(T.rotation, T.translation, 0.05))
 
     def plain(step):
         """Errors in pixels after a step of pose and bias."""
         R, t = perturbed(T.rotation[None], T.translation[None], step[None, :6])
         bias = 0.05 + step[6]
-        return CAMERA.project((landmarks + bias / (1.0 - share * bias) * per_pixel) @ R[0].T + t[0]) - pixels
+        return CAMERA.project((landmarks + bias / (1.0 - inverse_parallax * bias) * per_pixel) @ R[0].T + t[0]) - pixels
 
     numeric = np.array([(plain(e) - plain(-e)) / 2e-6 for e in 1e-6 * np.eye(7)])
     along = numeric[6] * sigma[:, None]
@@ -133,7 +138,7 @@ def test_exact_data_give_the_exact_pose():
 def test_images_cut_beside_the_axis_are_posed(column):
     rng = np.random.default_rng(2)
     T, landmarks, moved = true_pose(rng), scene(rng), [column - CAMERA.cx, 0.0]
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(len(landmarks)))
+    known = exact(landmarks)
     given = seen(T, landmarks) + moved, replace(CAMERA, cx=column), [RigidTransform.identity()]
     found = resect(known, *given, PARAMS, 7)
     np.testing.assert_allclose(found.T_local_left.matrix34, T.matrix34, atol=1e-9)
@@ -402,7 +407,7 @@ def test_a_wrong_prediction_does_no_harm():
     truth = true_pose(rng)
     landmarks = scene(rng)
     pixels = seen(truth, landmarks) + rng.normal(0, 0.2, (60, 2))
-    known = Landmarks(landmarks, np.zeros_like(landmarks), np.zeros(60))
+    known = exact(landmarks)
     astray = RigidTransform(rotation_exp([0.0, 1.5, 0.0]), np.array([3.0, 2.0, -4.0]))
     plain, misled = (
         resect(known, pixels, CAMERA, [RigidTransform.identity(), *others], PARAMS, 0) for others in ((), (astray,))
