@@ -170,7 +170,8 @@ def nees(P: Floats, aligned: Floats, covariance: Floats) -> Mapping[str, float |
     # The first frame is exact by definition and has no covariance to judge.
     rows = np.flatnonzero(known)[1:]
     if len(rows) == 0 or not known[np.argmax(claimed)]:
-        return dict.fromkeys(names, "no truth of the first posed frame, where the covariances begin, and of later ones")
+        why = "no truth of the first posed frame, where the covariances begin, and of later ones"
+        return dict.fromkeys(names, f"{why}: --frames may begin with one that has truth")
     if not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
         return dict.fromkeys(names, "a covariance is singular")
     turn = rotation_log(aligned[rows, :, :3] @ np.swapaxes(P[rows, :, :3], 1, 2))
