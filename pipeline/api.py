@@ -83,6 +83,7 @@ def reconstruct(
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
+    from rille.pipeline.engine.failures import translated
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
@@ -95,7 +96,12 @@ def reconstruct(
         cache=None if cache is None else str(cache),
         quiet=quiet,
     )
-    result = session.perform(given, options)
+    try:
+        result = session.perform(given, options)
+    except Exception as error:  # of the system, such as a full disk: `except RilleError` shall catch it as well
+        if (known := translated(error)) is None or known is error:
+            raise
+        raise known from error
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())

@@ -231,7 +231,16 @@ class Inline:
 def _here(jobs: int, memory: float) -> Dask:
     """Workers of this machine; they start while this process goes on."""
     leave_out()  # before anything else is imported
-    from distributed import Client, LocalCluster
+    from distributed import Client, LocalCluster, Nanny
+
+    nannies = list[Any]()
+
+    class Known(Nanny):  # type: ignore[misc]  # dask's types are unknown
+        """One that can be ended while its worker still starts: a cluster knows it only afterwards."""
+
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            nannies.append(self)
 
     _configure()
     resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
@@ -241,6 +250,7 @@ def _here(jobs: int, memory: float) -> Dask:
         cluster = LocalCluster(
             # With workers LocalCluster would block until they run; scale() returns at once.
             n_workers=0,
+            worker_class=Known,
             threads_per_worker=1,
             security=True,
             host="127.0.0.1",
@@ -256,7 +266,7 @@ def _here(jobs: int, memory: float) -> Dask:
         _, within = cluster.scheduler.listeners
         # As the default client it would take over whatever else the calling program computes with dask.
         client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
-        made = Dask(client, cluster=cluster)
+        made = Dask(client, cluster=cluster, nannies=nannies)
         made.scale(jobs)
     return made
 
@@ -284,10 +294,10 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
 
 
 class Dask:
-    """Workers of dask; ``cluster`` is one of our own, ``ours`` whether the client is."""
+    """Workers of dask; ``cluster`` is one of our own, with its ``nannies``, ``ours`` whether the client is."""
 
-    def __init__(self, client: Any, *, cluster: Any = None, ours: bool = True) -> None:
-        self._client, self._cluster, self._ours = client, cluster, ours
+    def __init__(self, client: Any, *, cluster: Any = None, nannies: Sequence[Any] = (), ours: bool = True) -> None:
+        self._client, self._cluster, self._nannies, self._ours = client, cluster, nannies, ours
         self._address = client.scheduler.address
         self._run, self._unused = f"rille-{uuid.uuid4().hex}", itertools.count()
         self._looked = self._manned = time.monotonic()
@@ -437,11 +447,10 @@ class Dask:
             if self._ours:
                 _leave(self._client, within)
             return
-        nannies = list(self._cluster.workers.values())
-        processes = [nanny.pid for nanny in nannies if nanny.pid]
+        processes = [nanny.pid for nanny in self._nannies if nanny.pid]
         if kill:
-            for nanny in nannies:
-                nanny.auto_restart = False  # else it starts a worker again as soon as that is killed
+            for nanny in self._nannies:
+                nanny.close_gracefully()  # else it starts a worker again as soon as that is killed
             _kill(processes)
         _leave(self._client, within)
         with suppress(Exception):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import doctest
+import errno
+import os
 import pickle
 import shlex
 import subprocess
@@ -218,3 +220,14 @@ def test_a_client_that_is_handed_in_computes_the_same_bits(run: rille.Run, tmp_p
     statuses = {row["status"] for row in events.read(again.folder / "ledger.jsonl")}
     assert statuses == {"computed"}
     assert digests(again.folder) == digests(run.folder)
+
+
+def test_a_failure_of_the_system_is_an_error_of_rille(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a notebook catches it, and the other sequences of a batch go on."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "config.toml")
+
+    monkeypatch.setattr("rille.pipeline.engine.runtime.atomic.write", full)
+    given = {"runs": tmp_path / "runs", "cache": tmp_path / "cache", "executor": "inline"}
+    assert [error.code for error in rille.reconstruct_many(["mockup-short"] * 2, **given)] == ["RIL-737"] * 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -218,3 +219,14 @@ def test_a_program_without_a_guard_is_refused_where_its_workers_import_it(tmp_pa
     assert found.returncode == 1
     assert 'under `if __name__ == "__main__":`' in found.stderr
     assert "line 3" in found.stderr, "the place in the program"
+
+
+def test_no_worker_that_still_starts_outlives_a_run_that_is_broken_off(tmp_path):
+    workers.resource_tracker.ensure_running()
+    before = set(psutil.Process().children())
+    made = workers.make("dask", 2, tmp_path, math.inf)
+    while len(set(psutil.Process().children()) - before) < 2:
+        time.sleep(0.01)
+    made.close(kill=True)
+    time.sleep(1)
+    assert set(psutil.Process().children()) == before
