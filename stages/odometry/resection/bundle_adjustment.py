@@ -29,11 +29,11 @@ from rille.stages.odometry.resection.pnp import (
     Errors,
     Observations,
     Pose,
+    PoseCovariances,
     back_projection,
     bias_information,
     huber_costs,
     huber_weights,
-    pose_covariance,
 )
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
@@ -236,19 +236,16 @@ class PoseErrors(NamedTuple):
     excess: float
 
 
-def pose_errors(tracks: SegmentTracks, state: SegmentState, params: ResectParams) -> PoseErrors:
+def pose_errors(problem: SegmentAdjustment, state: SegmentState) -> PoseErrors:
     """Errors of the poses of an adjusted segment, of position (m) and rotation vector (rad) of T_local_left."""
-    problem, prior = SegmentAdjustment(tracks, params), bias_information(params.bias_sigma)
+    tracks, factor, count = problem.tracks, problem.scatter(state), len(state.R)
     matrix, _ = problem.normal(state).without_depths()
-    matrix[-1, -1] -= prior  # which stays as it is, however large the errors are
-    factor = problem.scatter(state)
-    measured, stated = pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
-    count = len(state.R)
+    poses = PoseCovariances.of(matrix, problem.params.bias_sigma, factor)
     own, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SHARED_SOURCES)), list[float]()
     for f in range(count):
         seen = tracks.seen[f]
         depth = float(np.median(tracks.landmarks.position[seen] @ state.R[f, 2] + state.t[f, 2]))
-        own[f], shared[f] = frame_errors(measured, stated, state.R[f], depth, f)
+        own[f], shared[f] = frame_errors(poses, state.R[f], depth, f)
         errors = back_projection(problem.observations(f), Pose(state.R[f], state.t[f], state.bias))
         weight = problem.weights(errors, f)[seen]
         together.append(scatter_of_blocks(tracks.pixels[f][seen], errors.error[seen], weight, tracks.camera))

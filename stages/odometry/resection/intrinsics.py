@@ -42,7 +42,6 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.pnp import bias_information
-from rille.stages.odometry.resection.robust_pose import ResectParams
 
 PRIORS: Mapping[str, float] = {
     "focal length": 1.0,
@@ -181,14 +180,11 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
     return math.degrees(rigid.angle(state.R @ T_local_key.rotation).max())
 
 
-def contribution(
-    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: ResectParams
-) -> IntrinsicsPart:
+def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: SegmentCameras) -> IntrinsicsPart:
     """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
-    problem = SegmentAdjustment(tracks, params)
-    normal, k = problem.normal(state), len(PRIORS)
+    tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
     *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
-    steps = [SegmentAdjustment(one, params) for one in changed]
+    steps = [replace(problem, tracks=one) for one in changed]
     p, n = normal.between.shape
     by_pose, by_depth, squares, gradient = np.zeros((p, k)), np.zeros((k, n)), np.zeros((k, k)), np.zeros(k)
     for f in range(len(state.R)):
@@ -218,7 +214,7 @@ def contribution(
     moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
     along = (moved * ray).sum(1) / (ray**2).sum(1)
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
-    own = max(of_bias - bias_information(params.bias_sigma), 0.0)
+    own = max(of_bias - bias_information(problem.params.bias_sigma), 0.0)
     yaw = own * px_per_rad**2, of_bias * state.bias * px_per_rad
     return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw)
 

@@ -136,15 +136,14 @@ def adjust_segment(
     end = start and start.adjusted(adjust(start.tracks, start.state, params).state)
     if end is None:
         return {}
-    errors = pose_errors(end.tracks, end.state, params)
-    part = contribution(end.tracks, end.state, cameras, params)
+    problem = SegmentAdjustment(end.tracks, params)
+    errors, part = pose_errors(problem, end.state), contribution(problem, end.state, cameras)
     segment.covariance[end.frames], segment.shared[end.frames] = errors.covariance, errors.shared
     segment.by_intrinsics[end.frames] = part.by_error
     segment.landmarks[end.points] = end.landmarks()
     segment.inlier[:] = 0
     segment.inlier[end.points, 0] = end.tracks.seen.any(0)
     segment.inlier[np.ix_(end.points, end.frames)] = end.tracks.seen.T
-    problem = SegmentAdjustment(end.tracks, params)
     for f, row in enumerate(end.frames):
         segment.poses[row] = RigidTransform(end.state.R[f], end.state.t[f]).inverse().matrix34
         off = problem.errors(end.state, f).pixels[end.tracks.seen[f]]

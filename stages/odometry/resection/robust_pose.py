@@ -46,10 +46,8 @@ from rille.stages.odometry.resection.pnp import (
     Observations,
     Pose,
     PoseAdjustment,
-    PoseCovariance,
+    PoseCovariances,
     back_projection,
-    bias_information,
-    pose_covariance,
 )
 
 MIN_LANDMARKS = 6
@@ -163,8 +161,7 @@ def resect(
     _not_collinear(landmarks.position[active], where)
     depth = float(np.median(obs.landmarks.position[active] @ pose.R[2] + pose.t[2]))
     normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
-    measured, stated = _certainty(errors, normal, depth, params, where)
-    covariance, shared = frame_errors(measured, stated, pose.R, depth)
+    covariance, shared = frame_errors(_certainty(errors, normal, depth, params, where), pose.R, depth)
     return Resection(
         RigidTransform(pose.R, pose.t).inverse(),
         covariance,
@@ -246,16 +243,13 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
     return np.asarray(spread <= MAX_RELATIVE_SIGMA * depth)
 
 
-def _certainty(
-    errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str
-) -> tuple[PoseCovariance, PoseCovariance]:
-    """Covariances of a pose by the errors found, and by the larger of those and the stated ones."""
-    active, prior, matrix = normal.weight > 0, bias_information(params.bias_sigma), normal.matrix.copy()
-    matrix[6, 6] -= prior  # which stays as it is, however large the errors are
+def _certainty(errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str) -> PoseCovariances:
+    """Covariances of a pose; refuse one that is too uncertain by the stated errors."""
+    active = normal.weight > 0
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
     squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
-    expected = pose_covariance(matrix, prior)
+    expected = PoseCovariances.of(normal.matrix, params.bias_sigma, 1.0).stated
     position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
@@ -264,27 +258,25 @@ def _certainty(
             f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    return pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
+    return PoseCovariances.of(normal.matrix, params.bias_sigma, factor)
 
 
-def frame_errors(
-    measured: PoseCovariance, stated: PoseCovariance, R_cam_local: Floats, depth: float, at: int = 0
-) -> tuple[Floats, Floats]:
+def frame_errors(poses: PoseCovariances, R_cam_local: Floats, depth: float, at: int = 0) -> tuple[Floats, Floats]:
     """Covariance (6, 6) of one pose in the local frame by the errors found, and the root (6, 7) of what is shared.
 
     ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under a step (v, w); signs drop out of a covariance.
 
     Parameters
     ----------
-    measured, stated : scaled by the errors found, and by the larger of those and the expected ones; the difference is
-        what segments share, and ``stated`` has the part of the bias.
+    poses : those that were adjusted together; what the stated errors add to the measured ones is what segments share,
+        with the part of the bias.
     depth : median distance of the landmarks, m.
-    at : place of the pose among those that were adjusted together.
+    at : place of the pose among them.
     """
     turn, rows = np.kron(np.eye(2), R_cam_local.T), slice(6 * at, 6 * at + 6)
-    covariance = turn @ measured.noise[rows, rows] @ turn.T
-    shared = root(turn @ stated.noise[rows, rows] @ turn.T - covariance, depth)
-    return covariance, np.column_stack([shared, turn @ stated.by_bias[rows]])
+    covariance = turn @ poses.measured.noise[rows, rows] @ turn.T
+    shared = root(turn @ poses.stated.noise[rows, rows] @ turn.T - covariance, depth)
+    return covariance, np.column_stack([shared, turn @ poses.stated.by_bias[rows]])
 
 
 def root(covariance: Floats, depth: float) -> Floats:

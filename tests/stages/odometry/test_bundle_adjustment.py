@@ -188,7 +188,7 @@ def test_claimed_covariances_are_those_of_the_errors():
         rng = np.random.default_rng([seed, 1])
         views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal())
         state = adjust(views, start, PARAMS).state
-        covariance = pose_errors(views, state, PARAMS).covariance
+        covariance = pose_errors(SegmentAdjustment(views, PARAMS), state).covariance
         for R, t, true, claimed in zip(state.R, state.t, T, covariance, strict=True):
             found, right = RigidTransform(R, t).inverse(), true.inverse()
             turn = right.rotation @ found.rotation.T
