@@ -23,9 +23,6 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.rigid import rms
 from rille.stages.numeric.robust import mad_sigma
 
-ORIENTATION_SHARE = 0.1
-"""Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
-
 REST = 10.0
 """Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
 determine no rotation."""
@@ -85,8 +82,9 @@ def compare(
         arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
         arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
-        # A camera at rest: its positions are noise, and would turn the alignment to any side.
-        share = math.inf if rests else ORIENTATION_SHARE
+        # A camera at rest: its positions are noise, and would turn the alignment to any side. Otherwise positions
+        # decide it, as in an absolute trajectory error.
+        share = math.inf if rests else 0.1
         laid[piece == number] = rigid.compose(rigid.alignment(theirs[rows], ours[rows], share), theirs[piece == number])
         if not rests:
             both = np.stack([laid[rows, :, 3], ours[rows, :, 3]])

@@ -60,8 +60,6 @@ the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calib
 CORRECTED = 3
 """How many of these are corrected: those of the camera without distortion."""
 
-YAW_PRIOR = 0.1
-"""Standard deviation of the rig's yaw, rad, over that of the focal length, as of the other angles."""
 
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
@@ -328,7 +326,8 @@ def intrinsics_stage(
     )
     shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
     least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / focal
-    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([YAW_PRIOR * params.prior]), least)
+    # The yaw has the prior of the rig's other angles.
+    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([0.1 * params.prior]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:

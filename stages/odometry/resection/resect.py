@@ -38,7 +38,7 @@ from rille.stages.odometry.resection.robust_pose import (
     Resection,
     ResectParams,
     resect,
-    whole,
+    total_covariance,
 )
 from rille.stages.odometry.resection.two_motions import AmbiguousError, moving_by_themselves
 
@@ -86,7 +86,7 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     out.inlier[known[:, 0], 0] = 1
     count = int(known[:, 0].sum())
     out.facts.append({"frame": frames[0], "landmarks": count, "inliers": count, "rms_px": 0.0})
-    last, together = key, list[float]()
+    last, block_scatters = key, list[float]()
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
 
@@ -120,8 +120,8 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
         out.inlier[use, j] = posed.inlier
         facts |= {"inliers": int(posed.inlier.sum()), "rms_px": posed.rms_px}
         facts |= {} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())}
-        together.append(posed.together)
-    out.covariance[:] = whole(out.covariance, out.shared, together)
+        block_scatters.append(posed.block_scatter)
+    out.covariance[:] = total_covariance(out.covariance, out.shared, block_scatters)
     return out
 
 
