@@ -51,6 +51,9 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
 
+MIN_AFTER = 3
+"""Images from which on a clock that was set is told from images that are written late."""
+
 Reckoned = tuple[RigidTransform | None, ...] | None
 Used = TypeVar("Used")
 
@@ -190,7 +193,21 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
         if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
             text = f"{path}: two images of {topic} have the stamp {stamp}"
             raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
+    _check_clock(found, f"{path} {topic}")
     return found
+
+
+def _check_clock(found: Mapping[int, TakenImage], where: str) -> None:
+    """Refuse images, in the order of their recording by stamp, whose clock was set back meanwhile.
+
+    An image that is written late is later than its neighbours; after a clock was set back all are.
+    """
+    stamps, late = np.array(list(found)), np.array([one.at - stamp for stamp, one in found.items()])
+    for k in 1 + np.flatnonzero(np.diff(stamps) < 0):
+        if len(late) - k >= MIN_AFTER and late[k:].min() > late[:k].max():
+            text = f"{where}: header.stamp goes back by {(stamps[k - 1] - stamps[k]) / 1e9:.3g} s at image {k}"
+            remedy = "its clock was set meanwhile: cut the bag there, and take each part as a sequence"
+            raise InputError("RIL-958", text, remedy=remedy)
 
 
 def _joined(
@@ -219,7 +236,7 @@ def _joined(
 
 def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, np.ndarray]:
     """Cameras of the image topics, and the rotation from the left one's frame to its images'."""
-    infos = [_info(reader, topic) for topic in topics]
+    infos = [_info(reader, path, topic) for topic in topics]
     missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
     if missing is not None:
         found = Findings(path.parent, FoundImages("", "", 0, sizes, ""))
@@ -247,16 +264,21 @@ def _beside(topic: str) -> str:
     return f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
 
 
-def _info(reader: Any, topic: str) -> dict[str, Any] | None:
-    """Fields of the first ``camera_info`` of an image topic whose P is not 0, as that of no calibrated camera is.
+def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
+    """Fields of the ``camera_info`` of an image topic; messages whose P is 0, as of no calibrated camera, do not count.
 
     ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     """
-    infos = (
-        {key.lower(): getattr(m, key) for key in m.__dataclass_fields__}
-        for _, _, m in _messages(reader, _beside(topic))
-    )
-    return next((one for one in infos if np.any(one["p"])), None)
+    first: dict[str, Any] | None = None
+    for _, _, m in _messages(reader, _beside(topic)):
+        info = {key.lower(): getattr(m, key) for key in m.__dataclass_fields__ if key != "header"}
+        if not np.any(info["p"]):
+            continue
+        first = first or info
+        if changed := [key for key, value in info.items() if not np.array_equal(value, first[key])]:
+            text = f"{path}: {_beside(topic)} changes meanwhile: {', '.join(changed)}"
+            raise InputError("RIL-959", text, remedy="cut the bag there, or state the cameras in a manifest")
+    return first
 
 
 def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[CalibratedCamera, np.ndarray]:

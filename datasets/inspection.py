@@ -23,8 +23,8 @@ from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
-from rille.datasets.poses import names_positions, read_positions
-from rille.datasets.text.reading import Search, is_file, read_lines
+from rille.datasets.poses import names_positions, of_images, read_positions
+from rille.datasets.text.reading import Search, is_file, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -161,8 +161,15 @@ def _files(folder: Path, search: Search) -> list[Path]:
     # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
     runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
     paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)
-    kept = (path for path in paths if is_file(path) and not path.name.endswith(".rille.toml"))
-    return sorted(kept, key=lambda path: natural(str(path)))
+    return sorted(filter(_is_data, paths), key=lambda path: natural(str(path)))
+
+
+def _is_data(path: Path) -> bool:
+    """Whether a path is a file that is no manifest, whatever its name."""
+    with suppress(InputError):
+        if path.suffix == ".toml" and "images" in read_toml(path, "manifest"):
+            return False
+    return is_file(path)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -180,12 +187,19 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     InputError
         No names tell the images of two cameras apart.
     """
+    named: dict[tuple[int, str], list[tuple[str, int, Path]]] = defaultdict(list)
     groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
     names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
     for path, name in zip(images, names, strict=True):
-        at = side_of(name)
-        if at is not None:
-            groups[at[0], _place(path, at[2])][at[1]].append(path)
+        if (at := side_of(name)) is not None:
+            row, side, neutral = at
+            named[row, _place(path, neutral)].append((neutral, side, path))
+    for (row, place), found in named.items():
+        neutrals = list(dict.fromkeys(neutral for neutral, _, _ in found))
+        # Two sets in one folder: day1_left_07 and day2_left_07.
+        words = {neutrals[i]: word for word, of in pairing.by_one_word(neutrals).items() for i in of}
+        for neutral, side, path in found:
+            groups[row, f"{place} {words.get(neutral, '')}"][side].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
     if not both and (parts := pairing.by_one_word(names)):
         (first, ours), (second, theirs) = parts.items()
@@ -193,13 +207,13 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
-        named = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
+        counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
-        for path in images[: 0 if any(named) else 1]:
+        for path in images[: 0 if any(counts) else 1]:
             with suppress(InputError):
-                found = common_header([path]).header
-                remedy = f"{SPLIT}; else {remedy}" if found.width >= 2 * found.height else remedy
-        text = f"{folder} holds {len(images)} images, {named[0]} named as left and {named[1]} as right: no pairs"
+                header = common_header([path]).header
+                remedy = f"{SPLIT}; else {remedy}" if header.width >= 2 * header.height else remedy
+        text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
     # Most pairs first; of as many, the surest token (SIDES), and the shortest name: not left_depth before left.
@@ -236,6 +250,8 @@ def _place(path: Path, without: str) -> str:
 def pattern(paths: list[Path], folder: Path) -> str:
     """The narrowest simple pattern of a set of files in one folder (or in one folder a side)."""
     names = [path.name for path in paths]
+    if len({path.suffix for path in paths}) > 1:  # a search finds suffixes in any case
+        names = [path.stem + path.suffix.lower() for path in paths]
     below = {_relative(path.parent, folder) for path in paths}
     place = "" if below == {"."} else (glob.escape(min(below)) if len(below) == 1 else "**") + "/"
     if len(names) == 1:
@@ -313,7 +329,13 @@ def table_kind(path: Path, pairs: int) -> str:
     InputError
         It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
     """
-    read_lines(path, "table")  # refuses what is no text; of other files most are no tables, which is no error
+    # Refuses what is no text; of other files most are no tables, which is no error.
+    if of_images(path):
+        raise InputError(
+            "RIL-976",
+            f"{path} holds poses by COLMAP, at a scale that it need not know",
+            remedy='if they are in metres, state them as [truth] with file = "images.txt"',
+        )
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")

@@ -7,7 +7,9 @@ Forms of a file, one pose T_reference_body a row:
 * ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``);
-  of a robot on a plane ``x y`` and ``yaw`` or ``theta``.
+  of a robot on a plane ``x y`` and ``yaw`` or ``theta``;
+* ``colmap``: ``images.txt`` of a text model, two lines an image: number, quaternion w x y z and translation from the
+  world to the camera, the camera's number and the image's name; then its points, which are passed over.
 
 Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as the manifest
 states.
@@ -20,14 +22,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rille.datasets.images.files import SUFFIXES
 from rille.datasets.text import units
+from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
 from rille.datasets.text.units import unitless
@@ -42,6 +46,9 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
     "tum": ("time", *POSITION, "qx", "qy", "qz", "qw"),
     "euroc": ("time", *POSITION, *QUATERNION),
 }
+
+IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
+"""Line of an image in a model of COLMAP, where the name is that of an image."""
 
 WITHIN = 1e-6
 """s; times that agree to this are the same."""
@@ -84,12 +91,14 @@ class TimedPoses:
     poses : T_reference_body, metres, one a row; None of a row of NaN.
     name : the file, for messages.
     warnings : on rows that were left out.
+    images : names of the images, with or without folders, whose rows they are; empty where the file names none.
     """
 
     times: tuple[float, ...] | None
     poses: tuple[RigidTransform | None, ...]
     name: str = "poses"
     warnings: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()
 
 
 def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> TimedPoses:
@@ -106,6 +115,10 @@ def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> T
     InputError
         The form is not recognised, or a row is not a time and a pose; the message names the line.
     """
+    if found := of_images(path, format):
+        table, images = found
+        back = TimedPoses(None, _posed(table, _meanings(table), unit), table.name, images=images)
+        return replace(back, poses=tuple(pose and pose.inverse() for pose in back.poses))
     table = read_table(path, "pose file")
     meant = _meanings(table)
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
@@ -117,12 +130,30 @@ def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> T
         lost = ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1) if quaternion else False
         table, warnings = table.measured(list(columns.values()), np.asarray(lost))
     times = times_of(table, columns["time"]) if "time" in columns else None
-    rotations = _quaternions(table, columns) if quaternion else _angles(table, columns)
+    return TimedPoses(times, _posed(table, columns, unit), table.name, warnings)
+
+
+def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> tuple[RigidTransform, ...]:
+    """Poses of a table whose columns are rotations, and perhaps positions in units of ``unit`` m."""
+    rotations = _quaternions(table, columns) if columns.keys() >= set(QUATERNION) else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
     axes = [[columns[axis]] if axis in columns else [] for axis in POSITION]
     positions = np.hstack([table.measures(axis, units.LENGTHS, unit) if axis else nothing for axis in axes])
-    poses = tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
-    return TimedPoses(times, poses, table.name, warnings)
+    return tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
+
+
+def of_images(path: Path, format: str = "auto") -> tuple[TextTable, tuple[str, ...]] | None:
+    """Poses from the world to cameras and the images' names of COLMAP's ``images.txt``; None of any other file."""
+    if format not in ("auto", "colmap"):
+        return None
+    lines = enumerate(read_lines(path, "pose file"), start=1)
+    matches = ((k, IMAGE.fullmatch(line)) for k, line in lines if not line.lstrip().startswith("#"))
+    rows = [(k, *match.groups()) for k, match in matches if match and match[2].lower().endswith(SUFFIXES)]
+    if not rows:
+        return None
+    at, cells, images = zip(*rows, strict=True)
+    header = ("image", *QUATERNION, *POSITION, "camera")
+    return TextTable(str(path), header, tuple(tuple(text.split()) for text in cells), at, commas=False), images
 
 
 @dataclass(frozen=True)
@@ -151,7 +182,7 @@ def read_positions(
     InputError
         A column in ``columns`` does not exist, x or y is missing, or a cell is no number.
     """
-    if format not in ("auto", "csv"):
+    if format not in ("auto", "csv") or of_images(path, format):
         return None
     table = read_table(path, "file of positions" if columns else "pose file")
     stated = {meaning: _column(table, column) for meaning, column in columns.items()}

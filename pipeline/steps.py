@@ -194,8 +194,8 @@ def check_sections(settings: Mapping[str, object]) -> None:
     """Refuse a parameter that is given without its section."""
     for section, values in settings.items():
         if not isinstance(values, Mapping):
-            text = f"{section}={values!r} is no section"
-            raise ConfigError("RIL-861", text, remedy=f'give {section}={{"name": value}}')
+            text = f"{section}={values!r} is no section of parameters"
+            raise ConfigError("RIL-861", text, remedy='give them by section, e.g. locus={"cell_size": 0.002}')
 
 
 def assignments(settings: Mapping[str, Settings]) -> list[str]:

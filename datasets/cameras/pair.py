@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
@@ -11,6 +13,9 @@ from rille.stages.geometry.lens import Lens
 
 SHORTEST, LONGEST = 0.005, 1000.0
 """Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
+
+MAX_OFF_CENTRE = 0.1
+"""Share of an image's width by which a principal point usually lies off the centre at most."""
 
 
 def check_focal(camera: Camera, name: str) -> None:
@@ -47,10 +52,12 @@ def rig_of(
     Raises
     ------
     InputError
-        The image size or the relative pose is not known, a focal length cannot be, the cameras stand in one place, or
-        are swapped.
+        The image size or the relative pose is not known, the images are of another size than the calibration's, a focal
+        length cannot be, the cameras stand in one place, or are swapped.
     """
     of_left, of_right = sizes or (None, None)
+    if sizes is not None:
+        _check_scale((left, right), sizes)
     lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
     if left.T_camera_reference is None or right.T_camera_reference is None:
         lacking = left if left.T_camera_reference is None else right
@@ -79,19 +86,48 @@ def rig_of(
     return rig, distorted or None
 
 
+def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> None:
+    """Refuse images of another scale than a calibration that states no size, as its principal points show."""
+    scales = list[float]()
+    for camera, (width, height) in zip(cameras, sizes, strict=True):
+        c = camera.lens.camera
+        if camera.size is not None or min(c.cx, c.cy) <= 0:
+            return
+        scales += [width / (2 * c.cx + 1), height / (2 * c.cy + 1)]
+    scale = float(np.median(scales))
+    # Where the four differ, images were cut, or principal points are off: neither can be told from the other.
+    if max(scales) > 1.1 * min(scales) or abs(0.5 / scale - 0.5) <= MAX_OFF_CENTRE:
+        return
+    c, (width, height) = cameras[0].lens.camera, sizes[0]
+    text = (
+        f"the principal points of both cameras are the centres of images of some {2 * c.cx + 1:.0f} x "
+        f"{2 * c.cy + 1:.0f} pixels, the images are {width} x {height}"
+    )
+    remedy = (
+        f"give the calibration of images of this size (fx, fy, cx and cy times {scale:.2g}); if it is theirs, state it "
+        "with width and height in a manifest"
+    )
+    raise InputError("RIL-974", text, remedy=remedy)
+
+
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
+    c = camera.lens.camera
     if camera.size is not None and size is not None and camera.size != size:
-        turned = " (turned by their tag: magick mogrify -auto-orient FILES)" if camera.size == size[::-1] else ""
-        raise InputError(
-            "RIL-131",
-            f"camera {camera.name} is calibrated for {camera.size[0]} x {camera.size[1]} pixels, "
-            f"the images are {size[0]} x {size[1]}",
-            remedy=f"give the images as they were calibrated{turned}, or the calibration of images of this size",
-        )
+        (width, height), scale = camera.size, size[0] / camera.size[0]
+        remedy = "give the images as they were calibrated, or the calibration of images of this size"
+        if camera.size == size[::-1]:
+            remedy += " (turned by their tag: magick mogrify -auto-orient FILES)"
+        elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
+            # The centre of the first pixel is 0: its corner stays where it is.
+            cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
+            focal = f"fx = {c.fx * scale:.8g}, fy = {c.fy * scale:.8g}"
+            remedy += f"; if they were scaled, it has {focal}, cx = {cx:.8g}, cy = {cy:.8g} and the same distortion"
+        text = f"camera {camera.name} is calibrated for {width} x {height} pixels, the images are {size[0]} x {size[1]}"
+        raise InputError("RIL-131", text, remedy=remedy)
     if camera.size is None and size is None:
         text = f"the calibration of camera {camera.name} does not say how large its images are"
         raise InputError("RIL-132", text, remedy="give the size of the images")
     width, height = camera.size or size or (0, 0)
-    lens = replace(camera.lens, camera=replace(camera.lens.camera, width=width, height=height))
+    lens = replace(camera.lens, camera=replace(c, width=width, height=height))
     check_focal(lens.camera, camera.name)
     return lens

@@ -28,6 +28,7 @@ SHARE, MOST_APART = 0.25, 0.01
 
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
+    *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"), ("sinistra", "destra")),
     *((f"{name}0", f"{name}1") for name in ("cam", "cam_", "camera", "camera_", "image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
     *((f"{name}1", f"{name}2") for name in ("infra", "i")),

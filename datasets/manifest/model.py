@@ -41,7 +41,7 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
 
 Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_direction)]
-PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv"]
+PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv", "colmap"]
 Columns = dict[Literal["time", "x", "y", "z"], str | int]
 Deviation = Annotated[float, Field(ge=1e-6)]
 """A standard deviation: no sensor is as good, and 1e-300 would make every equation singular."""
@@ -259,7 +259,7 @@ class Poses(Recorded):
     Attributes
     ----------
     file : poses, one a pair, or with times.
-    format : kitti 3 x 4, tum, euroc or csv.
+    format : kitti 3 x 4, tum, euroc, csv, or colmap (images.txt, by the names of the left images).
     T_body_left : rows of [R | t], m: from the left camera's frame to the body's whose poses the file has.
     max_gap : s; poses are interpolated over no longer gap.
     """

@@ -7,7 +7,7 @@ import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,7 +18,15 @@ from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
-from rille.datasets.poses import TimedPositions, coverage, interpolate, read_poses, read_positions, refuse_apart
+from rille.datasets.poses import (
+    TimedPoses,
+    TimedPositions,
+    coverage,
+    interpolate,
+    read_poses,
+    read_positions,
+    refuse_apart,
+)
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
@@ -157,27 +165,24 @@ class MotionReader:
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
             return unit, [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
-        rows = list(self.arrived(rows))
-        if images or len(rows) not in self.counts():
+        taken = None if images else self.one_a_pair(rows)
+        if taken is None:
             more = f", none of {absent}" if by_name else ""
             which = ends([pair.left for pair in self.pairs])
             problem = f"{path} has {len(rows)} times for {len(self.pairs)} pairs ({which}){more}"
             raise IncompleteError("RIL-229", problem, remedy="give one line a pair, or lines of time and file name")
-        return unit, self.one_a_pair(rows)
+        return unit, taken
 
-    def counts(self) -> set[int]:
-        """Numbers of rows that a file may have: one a pair, or one for each pair with both images."""
-        return {len(self.pairs), sum(not pair.absent for pair in self.pairs)}
+    def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None] | None:
+        """One row a pair, or, where there are rows for whole pairs alone, None for the others; None: of other pairs.
 
-    def arrived(self, rows: Sequence[Row]) -> Sequence[Row]:
-        """The rows without those for images that are still to come."""
-        return rows[: len(self.pairs)] if self.growing else rows
-
-    def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None]:
-        """One row a pair; where there are rows for whole pairs alone (:meth:`counts`), None for the others."""
-        remaining = iter(rows)
-        partly = len(rows) < len(self.pairs)
-        return [None if partly and pair.absent else next(remaining) for pair in self.pairs]
+        Rows for images that are still to come are left out.
+        """
+        rows = rows[: len(self.pairs)] if self.growing else rows
+        if len(rows) == len(self.pairs):
+            return list(rows)
+        remaining, whole = iter(rows), sum(not pair.absent for pair in self.pairs)
+        return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
     def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
         """T_reference_left of each pair from a file of poses of a body."""
@@ -192,8 +197,10 @@ class MotionReader:
             moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
-        elif len(self.arrived(poses)) in self.counts():
-            poses = tuple(self.one_a_pair(self.arrived(poses)))
+        elif timed.images:
+            poses = self.of_images(timed)
+        elif (rows := self.one_a_pair(poses)) is not None:
+            poses = tuple(rows)
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
@@ -201,6 +208,25 @@ class MotionReader:
             return poses
         T_body_left = RigidTransform.from_matrix(section.T_body_left)
         return tuple(pose and pose @ T_body_left for pose in poses)
+
+    def of_images(self, timed: TimedPoses) -> Poses:
+        """The pose of each left image, by its name in the file; None of one that the file does not name.
+
+        Raises
+        ------
+        InputError
+            It names none of them, or one twice.
+        """
+        known = {PurePosixPath(image).parts: pose for image, pose in zip(timed.images, timed.poses, strict=True)}
+        # By as many of the path's last parts as the file states: COLMAP's names begin at its own folder of images.
+        paths = [pair.left.parts for pair in self.pairs]
+        stated = ([path[k:] for k in range(len(path)) if path[k:] in known] for path in paths)
+        poses = tuple(known[parts[0]] if parts else None for parts in stated)
+        if not any(poses):
+            text = f"{timed.name} has poses of {ends([Path(image) for image in timed.images])}, none of a left image"
+            left = ends([pair.left for pair in self.pairs])
+            raise InputError("RIL-975", f"{self.name}: {text} ({left})", remedy="give the model of these images")
+        return poses
 
     def truth(self, section: Truth) -> None:
         """Poses of each pair, or positions alone with their own times."""
@@ -258,7 +284,7 @@ class MotionReader:
             times = tuple(t + section.time_offset for t in found.times)
             refuse_apart(times, self.sequence.times, found.name)
             return found.positions, times
-        rows = tuple(self.arrived(found.positions))
+        rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         if len(rows) != len(self.pairs):
             text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
             remedy = "give one a pair, or times of both ([times] of the pairs)"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from rille.datasets.cameras.model import of_size, parallel
+from rille.datasets.cameras.model import UNKNOWN_SIZE, of_size, parallel
+from rille.datasets.cameras.pair import MAX_OFF_CENTRE
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
@@ -20,6 +20,9 @@ from rille.stages.geometry.lens import Lens
 
 LONGEST_BASELINE = 20.0
 """m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
+
+MAX_OFF_CENTRE_OF_UNKNOWN_SIZE = 0.04
+"""The same as ``MAX_OFF_CENTRE`` where a calibration states no size: then images that were cut show by nothing else."""
 
 USUAL_VIEW_DEG = (5.0, 175.0)
 """degrees; horizontal angle of view."""
@@ -125,7 +128,9 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
     assert value.fx is not None
     assert value.cx is not None
     assert value.cy is not None
-    camera = Camera(value.fx, value.fy or value.fx, value.cx, value.cy, value.width or size[0], value.height or size[1])
+    stated = value.width is not None or value.height is not None
+    width, height = (value.width or size[0], value.height or size[1]) if stated else UNKNOWN_SIZE
+    camera = Camera(value.fx, value.fy or value.fx, value.cx, value.cy, width, height)
     model = value.model or ("radtan" if value.distortion else "none")
     try:
         return CalibratedCamera(side, Lens(camera, model, value.distortion), None)
@@ -219,28 +224,22 @@ def check_baseline(baseline: float, section: RigSection, name: str) -> None:
         raise InputError("RIL-244", text, remedy=remedy)
 
 
-def unusual_cameras(cameras: Iterable[CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
+def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
     """Lines on a left and a right camera that are possible but strange, given images of these sizes."""
-    # A calibration need not state the size.
-    given = [replace(c.lens.camera, width=w, height=h) for c, (w, h) in zip(cameras, sizes, strict=True)]
-    return *unusual(given[0], "left"), *unusual(given[1], "right")
-
-
-def unusual(camera: Camera, side: str) -> list[str]:
-    """Lines on a camera that is possible but strange."""
     lines = []
-    view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))
-    if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
-        text = f"{side} camera: fx = {camera.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
-        lines.append(warning("RIL-690", text))
-    off = max(abs(camera.cx - camera.width / 2), abs(camera.cy - camera.height / 2)) / camera.width
-    # Of the width: principal points lie nearer to the centre, unless images were scaled or cut after the calibration
-    if off > 0.1:
-        place = f"({camera.cx:g}, {camera.cy:g}) px is far from the centre of {camera.width} x {camera.height} images"
-        of = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
-        scaled = f"scaled to {1 / max(of):.2g} of their size" if 0.0 < max(of) < 1.1 * min(of) else "scaled or cut"
-        lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were images {scaled}?"))
-    if not 0.8 < camera.fx / camera.fy < 1.25:
-        text = f"{side} camera: fx = {camera.fx:g} and fy = {camera.fy:g} px differ much: no square pixels"
-        lines.append(warning("RIL-691", text))
-    return lines
+    for side, calibrated, (width, height) in zip(("left", "right"), cameras, sizes, strict=True):
+        c = calibrated.lens.camera
+        view = math.degrees(2 * math.atan(width / 2 / c.fx))
+        if not USUAL_VIEW_DEG[0] <= view <= USUAL_VIEW_DEG[1]:
+            text = f"{side} camera: fx = {c.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
+            lines.append(warning("RIL-690", text))
+        off = max(abs(c.cx - width / 2), abs(c.cy - height / 2)) / width
+        if off > (MAX_OFF_CENTRE_OF_UNKNOWN_SIZE if calibrated.size is None else MAX_OFF_CENTRE):
+            place = (
+                f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height} images"
+            )
+            lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were they cut or scaled?"))
+        if not 0.8 < c.fx / c.fy < 1.25:
+            text = f"{side} camera: fx = {c.fx:g} and fy = {c.fy:g} px differ much: no square pixels"
+            lines.append(warning("RIL-691", text))
+    return tuple(lines)

@@ -17,6 +17,7 @@ import itertools
 import logging
 import math
 import multiprocessing
+import os
 import pickle
 import queue
 import re
@@ -142,7 +143,7 @@ def check(kind: Any, jobs: int | None = None) -> None:
     ------
     ConfigError
         It is neither one of the kinds nor an address nor an open ``Client`` of dask, or there are no ``jobs``; or this
-        process is a worker that imports its program.
+        process is a worker that imports its program, may start no workers, or was forked after a run.
     """
     if not isinstance(kind, str):
         from distributed import Client
@@ -158,8 +159,21 @@ def check(kind: Any, jobs: int | None = None) -> None:
     if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in at_work:
         text = "a worker that starts came to this call"
         raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
+    # One of multiprocessing's pools, or of another cluster of dask: Python lets no daemon start processes.
+    if kind == "dask" and multiprocessing.current_process().daemon:
+        text = "a process of a pool, or a worker of dask, cannot start workers"
+        raise ConfigError("RIL-542", text, remedy='give executor="inline"')
+    if _process_of_first_run() != os.getpid():
+        text = "this process was forked from one that had a run, whose threads it lacks: it would wait for ever"
+        raise ConfigError("RIL-543", text, remedy='start it by multiprocessing.get_context("spawn")')
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
+
+
+@cache
+def _process_of_first_run() -> int:
+    """Return the number of the process that asked first; a fork inherits the answer."""
+    return os.getpid()
 
 
 def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:

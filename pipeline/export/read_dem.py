@@ -31,6 +31,9 @@ from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.terrain.relief.grid import Grid
 
+MAX_PACKED_BYTES = 4_000_000
+"""Of a chunk of a zarr group, which has 512 x 512 values: zlib makes a thousand bytes of one at most, blosc 255."""
+
 MAX_CELLS = 500_000_000
 """Most cells of an elevation model, which is read whole."""
 
@@ -380,7 +383,8 @@ def check_group(path: Path) -> None:
     Raises
     ------
     InputError
-        It has such an array, or a file of it is no regular one: zarr would wait for a pipe for ever.
+        It has such an array, or one that might unpack to any size, or a file of it is no regular one: zarr would wait
+        for a pipe for ever.
     ValueError, OSError, KeyError, TypeError
         It is no zarr group.
     """
@@ -393,3 +397,8 @@ def check_group(path: Path) -> None:
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:
             size = " x ".join(map(str, array.shape))
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)
+        packed = max((file.stat().st_size for file in (path / name).iterdir()), default=0)
+        codecs = {getattr(codec, "codec_id", "") for codec in (*array.filters, *array.compressors)}
+        if array.metadata.zarr_format != 2 or codecs - {"zlib", "blosc"} or packed > MAX_PACKED_BYTES:
+            text = f"{path}: {name} is packed as Rille packs nothing, and may unpack to any size"
+            raise InputError("RIL-997", text, remedy=OURS)

@@ -60,8 +60,9 @@ def write_terrain(
     variables = {name: (("y", "x"), values, _attributes(spec)) for name, (spec, values) in arrays.items()}
     others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
     variables["elevation"][2].update(positive="up", ancillary_variables=" ".join(others))
-    # In every build of GDAL.
-    encoding: dict[str, Any] = {name: {"compressors": numcodecs.Zlib(level=1)} for name in arrays}
+    # In every build of GDAL. Of the coordinates stated as well: zarr's own default is another one in each version.
+    encoding: dict[str, Any] = {name: {"compressors": numcodecs.Blosc()} for name in ("x", "y", "spatial_ref")}
+    encoding |= {name: {"compressors": numcodecs.Zlib(level=1)} for name in arrays}
     for name, (spec, values) in arrays.items():
         encoding[name]["chunks"] = tuple(min(n, 512) for n in values.shape)
         encoding[name]["_FillValue"] = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None

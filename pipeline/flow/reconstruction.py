@@ -418,7 +418,8 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
             one = [known[f] for f in frames]
             said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
     times = list(frames) if s.times is None else [s.times[f] for f in frames]
-    return {**said, "times": times, "timed": s.times is not None, "georeferenced": s.georeference is not None}
+    place = None if s.georeference is None else {"origin": s.georeference.origin, "azimuth": s.georeference.azimuth}
+    return {**said, "times": times, "timed": s.times is not None, "georeference": place}
 
 
 def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:

@@ -187,20 +187,27 @@ def _local_paths(pairs: Rows) -> Items:
 
 def on_plane(view: RunView) -> bool:
     """Whether elevations are distances from a plane that is no ground."""
-    return any(facts_of(view, level).get("source") == REFERENCE_PLANE for level in view.products.level.values())
+    return bool(_on_planes(view))
+
+
+def _on_planes(view: RunView) -> list[Mapping[str, Any]]:
+    """Facts on the plane of each pair whose elevations are distances from one that is no ground."""
+    shown = [facts_of(view, level) for level in view.products.level.values()]
+    return [facts for facts in shown if facts.get("source") == REFERENCE_PLANE]
 
 
 def _reference(view: RunView) -> Items:
     """State that neither hazards nor paths were asked for, and why."""
-    if not on_plane(view):
+    planes = _on_planes(view)
+    if not planes:
         return []
-    first = facts_of(view, next(iter(view.products.level.values())))
+    first = planes[0]
     normal = ", ".join(f"{v + 0.0:.2f}" for v in first["T_local_left"][8:11])
     share = first["ground_share"]
     whose = f"the plane that {share:.0%} of the scene lies on" if share else "a plane, stated or across the view,"
     reason = f"{first['why']}: " if "why" in first else ""
     why = (
-        f"{reason}elevations are distances from {whose} (normal [{normal}] in the first camera's frame, "
+        f"{reason}elevations are distances from {whose} (normal [{normal}] in its camera's frame, "
         f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there"
     )
     if "world.up" not in reason:

@@ -27,6 +27,8 @@ LABELS: Mapping[str, str] = {
     "nees": "Squared error over the claimed one (NEES)",
     "nees_position": "The same, positions",
     "nees_rotation": "The same, rotations",
+    "hand_eye_turn": "Turn of the truth's body, as it fits best",
+    "hand_eye_shift": "Shift of the truth's body, as it fits best",
     "frames_missing": "Frames without a pose in the world",
     "rmse": "Elevation error, RMS",
     "nmad": "Elevation error, robust deviation (NMAD)",
@@ -139,7 +141,9 @@ def _assessed(
 
 
 def _label(name: str) -> str:
-    """``ate_first_frame_rmse`` to ``ATE first frame RMS``."""
+    """``ate_first_frame_rmse`` to ``ATE first frame RMS``; with the truth's body moved as without that."""
+    if (label := LABELS.get(name.removeprefix("hand_eye_"))) is not None:
+        return f"{label}, turn and shift of the truth's body left out"
     first, *rest = name.replace("rmse", "RMS").split("_")
     return " ".join([first.upper() if first in ("ate", "rpe") else first[0].upper() + first[1:], *rest])
 

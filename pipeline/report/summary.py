@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,8 +21,11 @@ from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
 from rille.stages.core.quantities import metres, number, quantity
 from rille.stages.evaluation import imu_check
+from rille.stages.facts.terrain import GroundFacts
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
+from rille.stages.terrain.reference import seen_up
 
 
 def collect(view: RunView) -> dict[str, Any]:
@@ -96,7 +99,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))
-    lines += _imu(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
+    lines += _sensors(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
     if compared is not None and compared.flagged.any():
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
@@ -164,7 +167,7 @@ def _displaced(view: RunView) -> list[str]:
     ]
 
 
-def _imu(view: RunView) -> list[str]:
+def _sensors(view: RunView) -> list[str]:
     """The IMU contradicts the images by its rotations, or it or a stated vertical the ground that they show."""
     # The ground also where elevations are measured from another plane.
     s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
@@ -174,10 +177,12 @@ def _imu(view: RunView) -> list[str]:
         sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
         times = np.array([s.times[f] for f in frames])
         lines += imu_check.of_rotations(world_poses(trajectory)[:, :, :3], sensed, times, axes)
-    for pair, level in ((pair, view.bundle(handle)) for pair, handle in levels.items()):
-        up = None if s.up is None else s.up[pair]
-        if level is not None and level.meta.get("seen_up") and up is not None:
-            return lines + imu_check.of_gravity(np.array(up), np.array(level.meta["seen_up"]), axes)
+    shown = [cast(GroundFacts, level.meta) for level in map(view.bundle, levels.values()) if level is not None]
+    for source, stated in (("attitude", None), ("pitch", s.pitch)):
+        told = [(facts, up) for facts in shown if facts["source"] == source and (up := seen_up(facts)) is not None]
+        if told:
+            given = np.array([RigidTransform.from_matrix(facts["T_local_left"]).rotation[2] for facts, _ in told])
+            lines += imu_check.of_vertical(given, np.array([up for _, up in told]), axes, stated)
     return lines
 
 
@@ -354,7 +359,7 @@ def _reads(run: RunView) -> tuple[object, ...]:
         *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
-        *(s.evaluation_window, s.georeference, s.times, s.up, s.attitude, s.imu_axes),
+        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes),
     )
 
 

@@ -7,7 +7,7 @@ useless or impossible. WARN: it gets worse, or the input is probably a mistake.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -24,6 +24,9 @@ from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
+
+MAX_SPEED = 60.0
+"""m/s between most records of a sensor, which no vehicle with stereo cameras drives."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,17 @@ LIMITS = {
     "attitude": (
         Fault("RIL-646", "degrees off", most=2.0, remedy="check T_body_left, the axes and degrees or radians"),
         InputLimit("RIL-647", "without", most=0, remedy="the other frames are matched without it"),
+    ),
+    "odometry": (
+        Fault("RIL-977", "m/s", most=MAX_SPEED, remedy="check its unit, and the unit of the times"),
+        InputLimit("RIL-978", "length over the truth's", least=0.8, most=1.25, remedy="check its unit and T_body_left"),
+        InputLimit("RIL-988", "without", most=0, remedy="the other frames are predicted without it"),
+    ),
+    "positions": (
+        Fault("RIL-989", "m/s", most=MAX_SPEED, remedy="check their unit, and the unit of the times"),
+        # Fewer hold no rotation of a trajectory.
+        InputLimit("RIL-990", "rows", least=3, remedy="is time_offset right, and the clock the images'?"),
+        InputLimit("RIL-991", "lengths over sigma", least=1.0, remedy="they say nothing of so short a way"),
     ),
     "up": (
         InputLimit("RIL-648", "known", least=1, remedy="the ground is levelled by its own plane"),
@@ -193,20 +207,70 @@ def judge_truth(
     if truth is None:
         return judge("truth", "none: accuracy is only known against the cross-check")
     known = [T for T in (truth[k] for k in frames) if T is not None]
-    length = sum(float(np.linalg.norm(b.translation - a.translation)) for a, b in pairwise(known))
-    words = f"{len(known)} of {len(frames)} frames, {length:.4g} m"
+    words = f"{len(known)} of {len(frames)} frames, {_length(known):.4g} m"
     return judge("truth", words, {"without": len(frames) - len(known)})
 
 
-def judge_attitude(
-    attitude: Sequence[Rows | None] | None, truth: Sequence[RigidTransform | None] | None, frames: Sequence[int]
+def judge_odometry(
+    odometry: Sequence[RigidTransform | None] | None,
+    truth: Sequence[RigidTransform | None] | None,
+    times: Sequence[float] | None,
+    frames: Sequence[int],
 ) -> Finding | None:
-    """Coverage of the attitude, and whether it turns as truth does."""
+    """Coverage, length and speed of the dead reckoning, and whether truth is as long."""
+    if odometry is None:
+        return None
+    known = [k for k in frames if odometry[k] is not None]
+    length, figures = _length(odometry[k] for k in known), {"without": float(len(frames) - len(known))}
+    words = f"{len(known)} of {len(frames)} frames, {length:.4g} m"
+    if times is not None and known and times[known[-1]] > times[known[0]]:
+        figures["m/s"] = length / (times[known[-1]] - times[known[0]])
+        words += f", {figures['m/s']:.3g} m/s"
+    both = [k for k in known if truth is not None and truth[k] is not None]
+    if truth is not None and (true := _length(truth[k] for k in both)) > 0:
+        share = figures["length over the truth's"] = _length(odometry[k] for k in both) / true
+        words += f", {share:.3g} of the truth's length"
+    return judge("odometry", words, figures)
+
+
+def judge_positions(
+    measured: Mapping[str, Any] | None, times: Sequence[float] | None, frames: Sequence[int]
+) -> Finding | None:
+    """How many measured positions are of the images' time, and how far and how fast they lead."""
+    if measured is None:
+        return None
+    at, places = np.array(measured["times"]), np.array(measured["positions"])
+    first, last = (float(k if times is None else times[k]) for k in (frames[0], frames[-1]))
+    inside = (at >= first) & (at <= last)
+    steps, sigma = np.linalg.norm(np.diff(places[inside], axis=0), axis=1), np.array(measured["sigma"])
+    words = f"{len(at)} rows, {int(inside.sum())} of them while the images were taken, {steps.sum():.4g} m"
+    figures = {"rows": int(inside.sum()), "lengths over sigma": float(steps.sum() / sigma[:2].max())}
+    if times is not None and len(steps):
+        figures["m/s"] = float(np.median(steps / np.diff(at[inside])))
+        words += f", {figures['m/s']:.3g} m/s"
+    each = " x ".join(f"{v:g}" for v in dict.fromkeys(sigma.tolist()))
+    return judge("positions", f"{words}; standard deviation {each} m", figures)
+
+
+def _length(poses: Iterable[RigidTransform | None]) -> float:
+    """Length, m, of the way between the poses that there are."""
+    known = [T.translation for T in poses if T is not None]
+    return sum(float(np.linalg.norm(b - a)) for a, b in pairwise(known))
+
+
+def judge_attitude(
+    attitude: Sequence[Rows | None] | None,
+    truth: Sequence[RigidTransform | None] | None,
+    frames: Sequence[int],
+    *,
+    imu: bool = False,
+) -> Finding | None:
+    """Coverage of the attitude, which may be that of an IMU, and whether it turns as truth does."""
     if attitude is None:
         return None
     known = [k for k in frames if attitude[k] is not None]
     true = {k: T.rotation for k in known if truth is not None and (T := truth[k]) is not None}
-    words, off = f"{len(known)} of {len(frames)} frames", 0.0
+    words, off = f"{'by the IMU, ' if imu else ''}{len(known)} of {len(frames)} frames", 0.0
     if len(true) > 1:
         both = np.array([attitude[k] for k in true]), np.array(list(true.values()))
         # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.

@@ -23,6 +23,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.conventions import better_reading
+from rille.stages.evaluation.hand_eye import hand_eye, misplaced, without_it
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
@@ -211,7 +212,13 @@ def accuracy_stage(
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
         stated = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
-        warnings = better_reading(estimate[both], true[both], mount or RigidTransform.identity(), stated)
+        body = mount or RigidTransform.identity()
+        warnings = better_reading(estimate[both], true[both], body, stated)
+        off = None if warnings else hand_eye(estimate, true)
+        if off is not None:
+            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, sigma_m, sigma_rad)
+            warnings = [misplaced(off, body, figures, without)]
+            figures |= without_it(off, without)
         if warnings:
             facts["warnings"] = warnings
     return Bundle(arrays, facts)

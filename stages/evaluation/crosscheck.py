@@ -97,6 +97,20 @@ def colmap_rig(rig: Rig) -> tuple[list[Any], Any]:
     return cameras, body
 
 
+def _widened(camera: Any) -> Floats:
+    """Columns and rows, px, by which points move in a camera that is made to hold its principal point.
+
+    COLMAP registers no image whose principal point lies outside of it, as that of images that were cut may do.
+    """
+    shift: Floats = np.maximum(-np.asarray(camera.params[2:], np.float64), 0.0)
+    camera.params = np.array([*camera.params[:2], *(camera.params[2:] + shift)])
+    camera.width, camera.height = (
+        math.ceil(max(size + by, c))
+        for size, by, c in zip((camera.width, camera.height), shift, camera.params[2:], strict=True)
+    )
+    return shift
+
+
 def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verified:
     """Rig, features and verified matches to the database; the matches of each image pair that has enough.
 
@@ -105,10 +119,11 @@ def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verifi
     from rille.stages.geometry.colmap import pycolmap
 
     cameras, body = colmap_rig(rig)
+    shifts = [_widened(camera) for camera in cameras]
     for camera in cameras:
         database.write_camera(camera, use_camera_id=True)
     database.write_rig(body, use_rig_id=True)
-    points = [np.asarray(b["points"]) for b in features]
+    points = [(np.asarray(b["points"]) + shifts[k % 2]).astype(np.float32) for k, b in enumerate(features)]
     descriptors = [np.asarray(b["descriptors"], np.float32) for b in features]
     for k in range(len(features) // 2):
         frame = pycolmap.Frame(frame_id=k + 1, rig_id=1)
@@ -198,6 +213,8 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     options.ba_refine_focal_length = options.ba_refine_principal_point = False
     options.ba_refine_extra_params = options.ba_refine_sensor_from_rig = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    # COLMAP registers no image of another focal length, in image widths; the calibration's are right.
+    options.min_focal_length_ratio, options.max_focal_length_ratio = 1e-3, 1e4
     options.init_image_id1, options.init_image_id2 = start
     options.multiple_models, options.init_num_trials = False, 1
     # A pixel of disparity at a focal length of 600 pixels.

@@ -1,4 +1,4 @@
-"""Whether an IMU contradicts the images: rates against the camera's rotations, gravity against ground that is seen.
+"""Whether sensors contradict the images: rates against the camera's rotations, verticals against ground that is seen.
 
 The sensor's rotation from frame to frame should be that of the images. If it is not, a signed exchange S of its axes,
 or the factor from degrees, is sought by which they agree. At rest only gravity can be compared, and only if the images
@@ -14,13 +14,17 @@ import numpy as np
 import scipy
 
 from rille.stages.core.arrays import Floats
+from rille.stages.geometry.geometry import level_rotation
 
 # Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
 MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
 # rad/s; the largest bias of a gyroscope, which a unit of degrees would make small, too.
 LARGEST_BIAS = 0.15
-# Of gravity against the normal of the ground: slopes are 15 degrees at most here.
-MIN_COSINE = np.cos(np.deg2rad(15.0))
+# Of a vertical against the normal of the ground: slopes are less, as far as a run's pairs see them.
+MAX_SLOPE_DEG = 15.0
+MIN_COSINE = np.cos(np.deg2rad(MAX_SLOPE_DEG))
+# Degrees off a pitch over the ground, so no slope, from which another sign of it is a cause.
+MIN_REVERSED_DEG = 5.0
 
 
 @cache
@@ -64,18 +68,35 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     return ["; ".join([*words, f"that leaves {np.degrees(off[best]):.2g} degrees"])]
 
 
-def of_gravity(given: Floats, seen: Floats, axes: Floats | None) -> list[str]:
-    """Warn where gravity contradicts the ground that is seen, and name the axes that would fit.
+def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float | None = None) -> list[str]:
+    """Warn where a stated or measured vertical contradicts the ground that is seen, and say what would fit.
 
     Parameters
     ----------
-    given, seen : (3,) up in the left camera's frame as stated or by a sensor, and by the ground.
+    given, seen : (pair, 3) up in the left camera's frame as stated or by a sensor, and by the ground.
     axes : (3, 3) R_imu_left; None: up is not an IMU's.
+    pitch : radians; the stated downward pitch over the ground that ``given`` follows from; None: from another source.
     """
-    off = float(np.degrees(np.arccos(np.clip(given @ seen, -1.0, 1.0))))
+    # Slopes to all sides cancel in the mean of the ground's normals, each in the frame that its own vertical levels.
+    tilt = np.mean([level_rotation(up) @ ground for up, ground in zip(given, seen, strict=True)], axis=0)
+    off = float(np.degrees(np.arctan2(np.hypot(tilt[0], tilt[1]), tilt[2])))
+    given, seen = given.mean(axis=0), seen.mean(axis=0)
+    if pitch is not None:
+        stated, found = np.degrees([pitch, np.arctan2(-seen[2], -seen[1])])
+        rest = abs(found + stated)
+        reversed_fits = off > MIN_REVERSED_DEG and rest < MAX_SHARE * off
+        if off <= MAX_SLOPE_DEG and not reversed_fits:
+            return []
+        line = (
+            f"world.pitch_deg = {stated:.3g} contradicts the images: by the ground that they show the camera looks "
+            f"down by {found:.3g} degrees"
+        )
+        return [line + (f"; with the other sign it is {rest:.2g} off" if reversed_fits else "; correct or remove it")]
+    if off <= MAX_SLOPE_DEG:
+        return []
     if axes is None:
         vertical = f"the stated vertical is {off:.0f} degrees off that of the ground which is seen"
-        return [f"{vertical}: correct up (its sign, too), the angles' unit, T_body_left or pitch_deg"]
+        return [f"{vertical}: correct up (its sign, too), the angles' unit or T_body_left"]
     a, b = axes @ given, axes @ seen
     fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(signed_axes()) if b @ S @ a > MIN_COSINE)
     told = "; or ".join(dict.fromkeys(names(signed_axes()[k]) for _, k in fits[:3]))

@@ -24,13 +24,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import counts, over_length
 from rille.stages.evaluation.conventions import UNITS
+from rille.stages.evaluation.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm, fit_rigid, in_both
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
-from rille.stages.geometry.rigid import by_frame, rms, umeyama
+from rille.stages.geometry.rigid import by_frame, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MIN_FRAMES = 4
@@ -55,11 +56,6 @@ MAX_TRIALS = 20000
 
 MAX_ERROR_SHARE = 0.5
 """Where other axes, another unit or a lever arm of the truth leave less than this share of the error, it is said."""
-
-
-MIN_SWING = 0.1
-"""RMS way of the antenna about the camera over its lever arm, from which on turns show it: they are 6 degrees."""
-
 
 MEASURED_VERTICAL = "attitude"
 """Source of the vertical by which heights of truth and world have one direction; ground is not level."""
@@ -91,14 +87,6 @@ class TruePositions:
         return np.where(known[:, None], places, np.nan)
 
 
-class Fit(NamedTuple):
-    """Truth moved into the world: (frame, 2 or 3) m; ``error``: RMS, m; ``relative``: over the extent of the tracks."""
-
-    moved: Floats
-    error: float
-    relative: float
-
-
 class Offset(NamedTuple):
     """Seconds to add to the times of the truth; ``low`` and ``high``: until there the squared error at most doubles, to
     half the time between frames.
@@ -110,26 +98,6 @@ class Offset(NamedTuple):
     low: float
     high: float
     determined: bool
-
-
-def fit_rigid(estimate: Floats, truth: Floats, upright: bool = True) -> Fit:
-    """Truth (frame, 2 or 3) turned and shifted to the estimated positions (frame, 3), m.
-
-    It is turned about the vertical alone where the world is ``upright``, i.e. its vertical was measured, and where the
-    truth has no heights. Rows of NaN in either do not count, but are moved as well.
-    """
-    width = truth.shape[1]
-    both = _both(estimate, truth)
-    if not both.any():
-        return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
-    centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
-    a, b = estimate[:, :width] - centre, truth - origin
-    turned = 2 if upright else width
-    b[:, :turned] = b[:, :turned] @ umeyama(b[both, :turned], a[both, :turned])[0].T
-    error = rms(a[both] - b[both])
-    # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
-    extent = np.hypot(rms(a[both]), rms(b[both]))
-    return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
 
 
 def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright: bool = True) -> Offset | None:
@@ -185,38 +153,6 @@ def _candidates(moments: Floats, truth: TruePositions) -> Floats:
     return np.linspace(low, high, int(np.clip((high - low) / step, 2, MAX_TRIALS)) + 1)
 
 
-def fit_lever_arm(poses: Floats, truth: Floats, upright: bool, moments: Floats | None = None) -> tuple[Floats, int]:
-    """The lever arm ``l`` (3,), m, by which ``P_i + R_i l`` fits the true positions best, and how much of it shows.
-
-    Along directions that the turns do not show, such as the axis of all turns, it is 0; others are counted.
-
-    Parameters
-    ----------
-    poses : (frame, 3, 4) T_world_left, m.
-    truth : (frame, 2 or 3) m, of a frame of its own.
-    moments : (frame,) s, where the truth has a clock of its own, which the arm ahead looks like; None: it has none.
-    """
-    both, width, arm, shown = _both(poses[:, :, 3], truth), truth.shape[1], np.zeros(3), np.zeros(3, bool)
-    P, R = poses[both, :, 3], poses[both, :, :3]
-    way = np.zeros_like(P)
-    if moments is not None:
-        # Two images of one moment have no speed.
-        way = np.gradient(P, axis=0) / np.maximum(np.gradient(moments[both]), 1e-9)[:, None]
-    for _ in range(20):
-        moved = fit_rigid(P + R @ arm, truth[both], upright).moved
-        # The fit of shift, turns and clock absorbs the part of an arm's swings that looks like them: project it out.
-        centred = np.pad(moved - moved.mean(axis=0), ((0, 0), (0, 3 - width)))
-        axes = np.eye(3)[2 if upright or width == 2 else 0 :]
-        turns = np.stack([*(np.cross(axis, centred) for axis in axes), way - way.mean(axis=0)], axis=2)
-        turns = turns[:, :width].reshape(-1, len(axes) + 1)
-        swings = (R - R.mean(axis=0))[:, :width].reshape(-1, 3)
-        off = centred[:, :width] - (P - P.mean(axis=0))[:, :width]
-        u, s, vt = np.linalg.svd(swings - turns @ np.linalg.pinv(turns) @ swings, full_matrices=False)
-        shown = s > MIN_SWING * np.sqrt(len(P))
-        arm = vt[shown].T @ ((u.T @ off.reshape(-1))[shown] / s[shown])
-    return arm, int(shown.sum())
-
-
 class Comparison(NamedTuple):
     """True positions (frame, 2 or 3) in the world, NaN where there are none, less the lever arm; figures; warnings."""
 
@@ -238,8 +174,7 @@ def position_accuracy(
     upright : whether the world's vertical was measured; else truth with heights is fitted in space.
     """
     without = _compared(poses, truth, moments, upright)
-    # With turn, shift and clock a lever arm has up to ten unknowns.
-    if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < 10:
+    if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < MIN_LEVER_FRAMES:
         return without
     lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)
@@ -272,7 +207,7 @@ def _compared(poses: Floats, truth: TruePositions, moments: Floats | None, uprig
             f"offset in time of the truth: not determined{kept}; from {offset.low:.2f} to {offset.high:.2f} s the "
             "tracks agree about as well: the motion changes too little"
         )
-    fit, both, width = fit_rigid(antenna, there, upright), _both(antenna, there), there.shape[1]
+    fit, both, width = fit_rigid(antenna, there, upright), in_both(antenna, there), there.shape[1]
     if both.sum() >= MIN_FRAMES:
         others = {words: fit_rigid(antenna, axes, upright) for words, axes in _otherwise(there).items()}
         best = min(others, key=lambda words: others[words].error)
@@ -283,10 +218,6 @@ def _compared(poses: Floats, truth: TruePositions, moments: Floats | None, uprig
     moved = fit.moved - np.nan_to_num(arm[:, :width])
     figures = _figures(poses[:, :, 3], moved, f"positions only, after a rigid fit {where}, {clock}")
     return Comparison(moved, figures | (_clock(offset) if offset else {}), warnings)
-
-
-def _both(estimate: Floats, truth: Floats) -> Bools:
-    return np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1))
 
 
 def _otherwise(truth: Floats) -> dict[str, Floats]:
@@ -303,7 +234,7 @@ def _otherwise(truth: Floats) -> dict[str, Floats]:
 
 def _figures(estimate: Floats, truth: Floats, how: str) -> dict[str, Metric]:
     """Figures of positions (frame, 3) against those of the truth (frame, 2 or 3), both in the world."""
-    both, width = _both(estimate, truth), truth.shape[1]
+    both, width = in_both(estimate, truth), truth.shape[1]
     figures, compared = counts(np.isfinite(estimate[:, 0]), np.isfinite(truth[:, 0])), int(both.sum())
     if compared < MIN_FRAMES:
         why = f"{compared} frames have a pose and a true position, {MIN_FRAMES} are needed"

@@ -34,6 +34,21 @@ MAX_TURN_DEG = 10.0
 MAX_HEIGHT_CHANGE_SHARE = 0.25
 
 
+def seen_up(facts: GroundFacts) -> Floats | None:
+    """Up (3,) in the left camera's frame by the ground that a pair shows; None where little of it is seen."""
+    if "seen_up" in facts:
+        return np.array(facts["seen_up"])
+    return _normal(facts) if facts["plane"] and facts["ground_share"] >= MIN_REFERENCE_SHARE else None
+
+
+def _normal(facts: GroundFacts) -> Floats:
+    """Unit normal (3,) of a pair's plane in the left camera's frame."""
+    assert facts["plane"] is not None
+    x, y, _ = facts["plane"]
+    local = np.array([-x, -y, 1.0]) / math.sqrt(x * x + y * y + 1.0)
+    return RigidTransform.from_matrix(facts["T_local_left"]).rotation.T @ local
+
+
 class GroundVerdict(NamedTuple):
     """Whether elevations are heights above ``ground``, and ``why``, in words."""
 
@@ -77,15 +92,14 @@ class _Plane(NamedTuple):
     def of(facts: GroundFacts) -> _Plane:
         """Read the plane of a pair."""
         assert facts["plane"] is not None
-        x, y, z = facts["plane"]
-        normal = np.array([-x, -y, 1.0]) / math.sqrt(x * x + y * y + 1.0)
-        up = RigidTransform.from_matrix(facts["T_local_left"]).rotation.T @ normal
+        up = _normal(facts)
+        level = float(RigidTransform.from_matrix(facts["T_local_left"]).rotation[2] @ up)
         share, reach = facts["ground_share"], facts["ground_reach"]
         is_known = facts["source"] not in (GROUND_PLANE, NO_VERTICAL)
-        is_level = is_known and float(normal[2]) >= math.cos(math.radians(MAX_TILT_DEG))
+        is_level = is_known and level >= math.cos(math.radians(MAX_TILT_DEG))
         # Ground that is stated (``ground_frame.reference_height``), not seen, has a share of 0.
         is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == 0.0
-        return _Plane(up, -z * float(normal[2]), is_ground, share, reach)
+        return _Plane(up, -facts["plane"][2] * level, is_ground, share, reach)
 
     def is_same(self, other: _Plane) -> bool:
         """Whether another pair shows the same plane."""

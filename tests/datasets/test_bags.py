@@ -456,3 +456,30 @@ def test_mosaics_of_16_bits_become_grey_as_those_of_8_do(tmp_path, filters):
             )
         shown.append(pixels(open_sequence(str(bag.write(tmp_path / str(bits)))), 0, "left"))
     assert np.abs(shown[1] / 257.0 - shown[0]).max() <= 1
+
+
+def test_cameras_that_change_in_a_recording_are_refused_unless_a_manifest_states_them(tmp_path):
+    bag = street(frames=4)
+    bag.info("/stereo/left/camera_info", (64, 48), [80.0, *P[1:]])
+    path = bag.write(tmp_path)
+    with raises("RIL-959", "camera_info changes"):
+        open_sequence(str(path))
+    manifest = tmp_path / "drive.toml"
+    stated = "fx = 50\ncx = 31\ncy = 24\n[rig]\nbaseline = 0.5\n"
+    manifest.write_text(f'[images]\nleft = "{path}"\nright = "{path}"\n[cameras]\n{stated}')
+    assert open_sequence(str(manifest)).frames == 4
+
+
+@pytest.mark.parametrize(("moved", "refused"), [([4, 5, 6, 7], True), ([4], False)])
+def test_a_clock_that_was_set_back_is_told_from_images_written_late(tmp_path, moved, refused):
+    bag = street(frames=0)
+    for k in range(8):
+        for side, topic in enumerate((LEFT, RIGHT)):
+            bag.image(topic, START + (k - 3 * (k in moved)) * STEP + 1000 * k, picture(k, side))
+            bag.rows[-1] = (topic, START + k * STEP, bag.rows[-1][2])
+    path = bag.write(tmp_path)
+    if refused:
+        with raises("RIL-958", "image 4"):
+            open_sequence(str(path))
+    else:
+        assert open_sequence(str(path)).frames == 8

@@ -66,6 +66,9 @@ def both(template: str, names: list[str]) -> list[str]:
         (["im0.png", "im1.png"], "im0.png", "im1.png", 1),
         (["infra1/7.png", "infra2/7.png"], "infra1/7.png", "infra2/7.png", 1),
         ([*both("{side}/{name}.png", ["1", "2"]), "left/9.jpg", "right/9.jpg"], "left/*.png", "right/*.png", 2),
+        (both("{side}/{name}", ["1.png", "2.PNG"]), "left/*.png", "right/*.png", 2),
+        ([f"{side}/{k}.png" for side in ("droite", "gauche") for k in (1, 2)], "gauche/*.png", "droite/*.png", 2),
+        (both("{name}_{side}_7.png", ["day1", "day2"]), "day*_left_7.png", "day*_right_7.png", 2),
     ],
 )
 def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
@@ -219,6 +222,24 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     told = " ".join(found.unread)
     assert "depth_left/*.png" in told
     assert "left/3.jpg" in told
+
+
+def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
+    days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
+    write_images(tmp_path, days)
+    found = inspect(tmp_path)
+    assert (found.views.left, found.views.right, found.views.pairs) == ("day1_left_*.png", "day1_right_*.png", 3)
+    assert any(line.startswith("day2_left_*.png and its right images") for line in found.unread)
+
+
+@pytest.mark.parametrize("name", ["my.rille.toml", "my.toml"])
+def test_a_manifest_in_the_folder_is_neither_calibration_nor_unread(tmp_path, name):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    (tmp_path / name).write_text(
+        '[images]\nleft = "left/*"\nright = "right/*"\n[cameras]\nfx = 1\n# a calibration: no\n'
+    )
+    found = inspect(tmp_path)
+    assert (found.calibration, found.unread) == (None, [])
 
 
 def test_times_with_names_of_images_or_dates_are_times(tmp_path):

@@ -16,6 +16,7 @@ from raising import raises
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.images.files import Digests
+from rille.datasets.inspection import inspect
 from rille.datasets.manifest import model
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest
@@ -399,6 +400,41 @@ def test_truth_of_a_body_becomes_that_of_the_left_camera(tmp_path):
         np.testing.assert_allclose(pose.rotation @ [0, 0, 1], [1, 0, 0])
 
 
+COLMAP = """# Image list with two lines of data per image:
+#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
+#   POINTS2D[] as (X, Y, POINT3D_ID)
+7 {half} 0 {half} 0 0 0 -2 1 {folder}02.png
+1 2 3 4 5 6 7 8 9 1.5 2.5 -1
+3 1 0 0 0 0 0 0 1 {folder}00.png
+
+4 1 0 0 0 -0.3 0 0 2 right/00.png
+1.5 2.5 -1
+"""
+
+
+@pytest.mark.parametrize("folder", ["left/", "", "other/"])
+def test_truth_of_colmap_is_that_of_the_images_that_it_names(tmp_path, folder):
+    path = write_sequence(tmp_path, '[truth]\nfile = "images.txt"\n')
+    (tmp_path / "images.txt").write_text(COLMAP.format(half=math.sqrt(0.5), folder=folder))
+    if folder == "other/":
+        with raises("RIL-975", "02.png"):
+            opened(path)
+        return
+    first, second, third = opened(path).truth
+    assert second is None
+    np.testing.assert_allclose(first.matrix34, np.eye(3, 4))
+    # x_camera = R x_world + t: a quarter turn about y, and the world's origin 2 m behind.
+    np.testing.assert_allclose(third.matrix34, [[0, 0, -1, -2], [0, 1, 0, 0], [1, 0, 0, 0]], atol=1e-9)
+
+
+def test_poses_of_colmap_are_named_to_whoever_has_to_know_their_scale(tmp_path):
+    write_sequence(tmp_path)
+    (tmp_path / "images.txt").write_text(COLMAP.format(half=math.sqrt(0.5), folder="left/"))
+    found = inspect(tmp_path)
+    assert "truth" not in found.tables
+    assert any("poses by COLMAP" in line and "[truth]" in line for line in found.unread)
+
+
 def test_truth_with_a_gap_is_a_warning(tmp_path):
     path = write_sequence(tmp_path, '[times]\nrate_hz = 1.0\n[truth]\nfile = "p.tum"\nmax_gap = 1.0\n', frames=6)
     write_lines(tmp_path / "p.tum", [tum(t, t) for t in (-0.5, 0.5, 1.5, 3.5, 4.5, 5.5)])
@@ -646,9 +682,9 @@ def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
         ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
-            r"principal point \(315, 23\.5\) px is far from .* scaled or cut",
+            r"principal point \(315, 23\.5\) px is 442 % of the width off the centre .* cut or scaled",
         ),
-        ({"cameras": "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"}, r"were images scaled to 0\.5 of their size"),
+        ({"cameras": "[cameras]\nfx = 60.0\ncx = 35.0\ncy = 23.5\n"}, r"px is 4\.69 % of the width off the centre"),
         ({"cameras": CAMERAS + "fy = 120.0\n"}, r"fx = 60 and fy = 120 px differ much"),
     ],
 )
@@ -656,6 +692,17 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     warnings = opened(write_sequence(tmp_path, **parts)).warnings
     assert any(re.search(line, w) for w in warnings)
     assert len(warnings) <= 2
+
+
+def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_the_figures_are_said(tmp_path):
+    of_twice_the_size = "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"
+    with raises("RIL-974", "some 128 x 96 pixels, the images are 64 x 48", "cx and cy times 0.5"):
+        opened(write_sequence(tmp_path, cameras=of_twice_the_size))
+    with raises("RIL-131", "fx = 60, fy = 60, cx = 31.5, cy = 23.5"):
+        opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 128\nheight = 96\n"))
+    # It is the images' own: stated as such, or with a lens off the middle of one side.
+    assert opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 64\nheight = 48\n")).warnings
+    assert opened(write_sequence(tmp_path, cameras="[cameras]\nfx = 60.0\ncx = 63.5\ncy = 23.5\n")).warnings
 
 
 @pytest.mark.parametrize("fx", [0.004, 0.1, 1e9])

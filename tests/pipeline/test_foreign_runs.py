@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numcodecs
 import numpy as np
 import pytest
 import rasterio
@@ -183,6 +184,19 @@ def huge(folder: Path, axis: int) -> None:
 def test_a_zarr_group_that_claims_more_than_can_be_read(run: Path) -> None:
     huge(run / "terrain.zarr", 10**10)
     with raises("RIL-982"):
+        assert open_run(run).terrain
+
+
+@pytest.mark.parametrize("codec", [numcodecs.Zlib(9), numcodecs.Zstd()])
+def test_a_zarr_group_that_unpacks_to_more_than_it_claims(run: Path, codec: Any) -> None:
+    """A chunk of 8 kB that a few megabytes stand for, which zlib makes gigabytes of; zstd needs a few kilobytes."""
+    group = zarr.create_group(store=str(run / "terrain.zarr"), zarr_format=2)
+    x = group.create_array("x", shape=(1000,), chunks=(1000,), dtype="f8", compressors=codec)
+    x.attrs["_ARRAY_DIMENSIONS"] = ["x"]
+    x[:] = 1.0
+    if isinstance(codec, numcodecs.Zlib):
+        (run / "terrain.zarr" / "x" / "0").write_bytes(bytes(5_000_000))
+    with raises("RIL-997"):
         assert open_run(run).terrain
 
 

@@ -25,6 +25,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, LoopFacts, ResectFacts, TrajectoryFacts
 from rille.stages.geometry.geometry import RigidTransform, rotation_log
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.geometry.rigid import compose, lengths_along
 from rille.stages.odometry.pose_graph import EXCESS, Adjusted, Factors, GraphState, PoseGraph, root_of
 from rille.stages.odometry.resection.priors import Sensors
@@ -157,7 +158,7 @@ def adjust_stage(
     stated = measured_alike(stated_factors(given, row), chain, calibration)
     sensors = Sensors.of(priors or {}, len(frames))
     own = OwnTrajectory(out.poses[posed], out.piece[posed], sensors.times[posed], posed)
-    sensors.drop_contradicting(own)
+    sensors.drop_contradicting(own, upright=NO_VERTICAL not in trajectory.meta["verticals"])
     between = Factors.joined([stated, *sensors.relative_factors(own)])
     sure = np.arange(len(between.ends)) >= len(given)
     apart, own = own.poses, sensors.joined_by_positions(join(own, between, sure))

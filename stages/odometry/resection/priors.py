@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
 from rille.stages.odometry.resection.sensors import (
     MIN_FIXES,
@@ -34,6 +34,10 @@ MAX_SIGMA_SHARE = 0.1
 """Of the standard deviation that a clock's offset had before, up to which it is determined."""
 MANY_LEFT_OUT = 0.05
 """Share of a sensor's measurements from which on those that were left out are worth a word."""
+MIN_LEAN = math.radians(0.05)
+"""Of the world against the vertical that is not worth a word: 1 mm a metre."""
+OTHER_FRAME_M = 1000.0
+"""Distance of the world's origin by positions from the stated one, from which on their frame is another one."""
 MAX_SHARED_SIGMAS = 4.0
 """Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
 REMEDY = {
@@ -42,6 +46,7 @@ REMEDY = {
     "positions": "correct columns, unit, lever_arm or time_offset, or raise sigma",
     "up": "correct T_body_left (T_imu_left), the order of its columns or up, or raise sigma_deg",
 }
+UNLEVEL = "positions are turned about the vertical alone, and nothing tells of the vertical"
 
 
 class Clock(NamedTuple):
@@ -60,14 +65,14 @@ class Clock(NamedTuple):
 class Sensors:
     """Other sensors of a trajectory by name; ``lines`` collects what is noticed.
 
-    ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeferenced``: the
-    world has a place on Earth. ``facts`` of each sensor.
+    ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeference``: the
+    place of the world on Earth, where it is stated. ``facts`` of each sensor.
     """
 
     used: dict[str, Sensor]
     times: Floats
     timed: bool
-    georeferenced: bool
+    georeference: Mapping[str, Any] | None
     lines: list[str] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
 
@@ -93,18 +98,21 @@ class Sensors:
             used["positions"] = PositionPrior.of(given["positions"], clocked=timed)
         if "up" in given:
             used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
-        return Sensors(used, times, timed, bool(given.get("georeferenced", False)))
+        return Sensors(used, times, timed, given.get("georeference"))
 
-    def drop_contradicting(self, own: OwnTrajectory) -> None:
-        """Leave out the sensors that contradict the camera's own chain, and say so."""
+    def drop_contradicting(self, own: OwnTrajectory, *, upright: bool) -> None:
+        """Leave out the sensors that contradict the camera's own chain, and say so; ``upright``: its z is known."""
         for name, sensor in list(self.used.items()):
             if reason := sensor.contradiction(own):
-                self._refuse(name, reason, "contradicts the images and ")
+                if name == "positions" and not upright:
+                    self._refuse(name, UNLEVEL, "", "state world.up")
+                else:
+                    self._refuse(name, reason, "contradicts the images and ")
 
-    def _refuse(self, name: str, reason: str, how: str = "") -> None:
+    def _refuse(self, name: str, reason: str, how: str = "", remedy: str = "") -> None:
         del self.used[name]
         self.facts[name] = {"used": False, "why": reason}
-        self.lines.append(f"[{name}] {how}is not used: {reason}: {REMEDY[name]}")
+        self.lines.append(f"[{name}] {how}is not used: {reason}: {remedy or REMEDY[name]}")
 
     def relative_factors(self, own: OwnTrajectory) -> list[Factors]:
         """Factors of ways between frames, which may join pieces, clocks being right."""
@@ -150,7 +158,10 @@ class Sensors:
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
         clocks = self._clocks(groups, clocks, done, common)
-        self._account(groups, clocks, done.state.poses[-1])
+        self._account(groups, clocks)
+        if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
+            self._locate(done, positions.laid)
+            self._level(done)
         return whole, done
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
@@ -194,8 +205,8 @@ class Sensors:
                 clocks[name] = clock if clock.determined else clock._replace(late=0.0)
         return clocks
 
-    def _account(self, groups: Collection[str], clocks: Mapping[str, Clock], place: Floats) -> None:
-        """Facts and lines of the sensors that a piece was adjusted to; ``place`` (3, 4) is its pose in the world."""
+    def _account(self, groups: Collection[str], clocks: Mapping[str, Clock]) -> None:
+        """Facts and lines of the sensors that a piece was adjusted to."""
         for name, clock in clocks.items():
             self.facts[name] |= {
                 "late_s": clock.late,
@@ -215,12 +226,40 @@ class Sensors:
             if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
-        if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
-            there = (RigidTransform.from_matrix(place) @ positions.laid).inverse()
-            origin, ahead = there.translation, there.rotation[:, 1]
-            azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
-            self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
-            if not self.georeferenced:
-                where = ", ".join(f"{v:.2f}" for v in origin)
-                text = f"[positions] in their frame world.origin is [{where}] and world.azimuth_deg is {azimuth:.2f}"
-                self.lines.append(f"{text}: state these with world.crs, and maps lie there")
+
+    def _locate(self, done: Adjusted, laid: RigidTransform) -> None:
+        """Say where the world lies in the frame of positions, unless that is stated; ``laid`` as of their prior."""
+        there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ laid).inverse()
+        origin, ahead = there.translation, there.rotation[:, 1]
+        azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
+        self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
+        named = f"world.origin is [{', '.join(f'{v:.2f}' for v in origin)}] and world.azimuth_deg is {azimuth:.2f}"
+        if self.georeference is None:
+            self.lines.append(f"[positions] in their frame {named}: state these with world.crs, and maps lie there")
+            return
+        variances = np.diag(done.graph.covariance(done.state)[-1])
+        off = float(np.linalg.norm(origin - self.georeference["origin"]))
+        turn = math.radians(azimuth) - self.georeference["azimuth"]
+        turn = abs(math.remainder(turn, math.tau))
+        apart = off > MIN_SIGMAS * math.sqrt(variances[:3].sum())
+        turned = turn > max(MIN_SIGMAS * math.sqrt(variances[5]), MIN_LEAN)
+        if off < OTHER_FRAME_M and (apart or turned):
+            text = f"maps lie {off:.2f} m off at the origin and are turned by {math.degrees(turn):.2f} degrees"
+            self.lines.append(f"[positions] contradict the stated place: {text}; by them {named}: state these")
+
+    def _level(self, done: Adjusted) -> None:
+        """Say by how much the world leans against the positions' vertical, if they show it."""
+        variances, axes = np.linalg.eigh(done.graph.covariance(done.state)[-1, 3:5, 3:5])
+        # The top of z moves by w x z. Along a straight way positions show one turn of two: the other is left as it is.
+        x, y, _ = done.state.R[-1, :, 2]
+        turns = axes.T @ [-y, x]
+        shown = np.abs(turns) > MIN_SIGMAS * np.sqrt(variances)
+        size, sigma = math.hypot(*turns[shown]), math.sqrt(variances[shown].sum())
+        if size > MIN_LEAN:
+            turn = axes[:, shown] @ turns[shown]
+            up = done.state.R[0].T @ rotation_exp([*turn, 0.0])[:, 2]
+            self.lines.append(
+                f"[positions] the world leans by {math.degrees(size):.2f} degrees (standard deviation "
+                f"{math.degrees(sigma):.2f}) against their vertical, and elevations with it: for level maps state "
+                f"world.up = [{', '.join(f'{v:.4f}' for v in up)}], which is up in the left camera of its first frame"
+            )

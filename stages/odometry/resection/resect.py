@@ -40,7 +40,8 @@ from rille.stages.odometry.resection.robust_pose import (
     resect,
     total_covariance,
 )
-from rille.stages.odometry.resection.two_motions import AmbiguousError, moving_by_themselves
+from rille.stages.odometry.resection.two_motions import CONTRADICTION, AmbiguousError, moving_by_themselves
+from rille.stages.odometry.resection.zoom import refuse_zoom
 
 MIN_JUMP_PX = 1.0
 """Median departure [pixels of the coarser image] of a basic pair's disparities from the pair's before from which on the
@@ -91,8 +92,15 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     trusted = np.ones(len(known), bool)
 
     def posed_by(use: NDArray[np.intp], j: int) -> Resection:
-        pixels = points.tracks[use, j].astype(np.float64)
-        return resect(points.landmarks.take(use), pixels, points.camera, [last], params, frames[j])
+        pixels, landmarks = points.tracks[use, j].astype(np.float64), points.landmarks.take(use)
+        agreeing, bound = 0, CONTRADICTION * params.threshold
+        try:
+            posed = resect(landmarks, pixels, points.camera, [last], params, frames[j])
+            agreeing = int((posed.residual <= bound).sum())
+        finally:
+            # Also where no pose is found: a zoom is the cause then.
+            refuse_zoom(landmarks.position, pixels, points.camera, agreeing, bound, frames[j])
+        return posed
 
     for j in range(1, len(frames)):
         # What once moved by itself is no landmark: seen longer than others, or standing for a while, it might prevail.

@@ -17,6 +17,7 @@ from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.options import Settings
+from rille.stages.geometry.geometry import RigidTransform
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -211,3 +212,13 @@ def test_a_run_says_that_it_spreads_samples_that_leave_bits_empty(tmp_path, scal
     found = [line for line in session.settings_of_run(str(path), options).sequence.warnings if "RIL-827" in line]
     assert ["(sample - 0) x 8" in line for line in found] == [True] * told
     assert not session.settings_of_run("mockup-loop", options).sequence.warnings, "no image is there before the drive"
+
+
+def test_sensors_have_a_line_each(tmp_path, capsys):
+    sequence = open_sequence(str(folder(tmp_path / "wall")))
+    measured = {"times": [0.0, 1.0, 2.0], "positions": [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]], "sigma": [0.01] * 3}
+    rest = (RigidTransform.identity(),) * 4
+    look(replace(sequence, odometry=rest, priors={"positions": measured}), tmp_path / "cache")
+    lines = capsys.readouterr().out.splitlines()
+    assert "4 of 4 frames, 0 m" in line(lines, "odometry")
+    assert "3 rows, 3 of them while" in line(lines, "positions")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
 from rille.stages.core.declare import NoParams
+from rille.stages.core.errors import ConfigError
 
 HERE = Path(__file__).resolve().parent.parent
 
@@ -174,6 +176,30 @@ def test_of_clusters_and_clients_only_a_synchronous_client_is_taken():
         workers.check(client)
         with raises("RIL-588"):
             workers.check(cluster)
+
+
+def code_in_a_pool(how, kind):
+    """Code with which a process of a pool is refused."""
+    with multiprocessing.get_context(how).Pool(1) as pool:
+        return pool.apply(code_of_refusal, (kind,))
+
+
+def code_of_refusal(kind):
+    try:
+        workers.check(kind)
+    except ConfigError as error:
+        return error.code
+    return ""
+
+
+def test_a_process_of_a_pool_starts_no_workers():
+    assert code_in_a_pool("spawn", "dask") == "RIL-542"
+    assert code_in_a_pool("spawn", "inline") == ""
+
+
+def test_a_process_forked_after_a_run_is_refused():
+    workers.check("inline")
+    assert code_in_a_pool("fork", "inline") == "RIL-543"
 
 
 def test_a_program_without_a_guard_is_refused_where_its_workers_import_it(tmp_path):

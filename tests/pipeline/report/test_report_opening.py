@@ -12,6 +12,7 @@ from rille.pipeline.report import delivery, page, summary, terrain_map
 from rille.pipeline.report.gather import WorldTerrain
 from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.risk import REASONS, RiskParams
 from rille.stages.hazard.vehicle import Vehicle
@@ -116,6 +117,15 @@ def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
     assert [fact for fact in facts if fact not in told[0]["what"]] == []
 
 
+def test_the_plane_of_the_first_pair_that_has_one_is_told():
+    plane = {"source": "reference plane", "T_local_left": RigidTransform.identity().to_list(), "ground_share": 0.4}
+    view = SimpleNamespace(bundle=lambda handle: handle, products=SimpleNamespace(level={0: None, 3: None}))
+    assert delivery._reference(view) == []
+    view.products.level[3] = Bundle({}, plane)
+    (item,) = delivery._reference(view)
+    assert "the plane that 40% of the scene lies on (normal [0.00, 0.00, 1.00]" in item["why"]
+
+
 def test_what_the_images_contradict_is_told_before_what_failed():
     view = SimpleNamespace(tasks=failed("locus/local/1", "no ground at -0.1"), vehicle_source="", part="")
     view.tasks += failed("locus/local/2", "no ground at 0.25")
@@ -198,17 +208,25 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
     """A camera at rest by its images; rates in degrees a second, and gravity off the ground that is seen."""
     run = given(np.zeros((9, 3)), AHEAD, None)
     run.products.trajectory.meta["frames"] = list(range(9))
+    level = RigidTransform(AHEAD, np.zeros(3)).to_list()
+    ground = {"source": "attitude", "T_local_left": level, "plane": None, "ground_share": 0.0}
+    run.products.ground[0].meta.update(ground)
     spun = [Rotation.from_rotvec([0.0, 0.2 * k, 0.0]).as_matrix() for k in range(9)]
-    known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "up": [(0.0, -1.0, 0.0)] * 9, "attitude": spun}
+    known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "pitch": None, "attitude": spun}
     run.sequence.__dict__.update(known)
-    (rates,) = summary._imu(run)
+    (rates,) = summary._sensors(run)
     assert "degrees a second" in rates
     run.products.ground[0].meta["seen_up"] = [0.0, 0.0, -1.0]
     run.sequence.attitude = [np.eye(3)] * 9
-    (gravity,) = summary._imu(run)
+    (gravity,) = summary._sensors(run)
     assert "up is 90 degrees off" in gravity
-    run.sequence.up = None
-    assert summary._imu(run) == []
+    run.sequence.imu_axes = None
+    run.products.ground[0].meta.update(source="pitch")
+    run.sequence.pitch = 0.0
+    (pitch,) = summary._sensors(run)
+    assert "looks down by 90 degrees" in pitch
+    run.products.ground[0].meta.update(source="none")
+    assert summary._sensors(run) == []
 
 
 @pytest.mark.parametrize(("warnings", "told"), [([], 1), (["the truth fits better by another convention"], 0)])

@@ -91,6 +91,45 @@ def test_attitude_against_truth():
     assert input_checks.judge_attitude([*right[:3], None], truth, range(4)).level == "WARN"
 
 
+def ahead(*z: float | None) -> list[RigidTransform | None]:
+    return [None if v is None else RigidTransform(np.eye(3), np.array([0.0, 0.0, v])) for v in z]
+
+
+@pytest.mark.parametrize(
+    ("z", "times", "level", "words"),
+    [
+        ((0.0, 1.0, 2.0), None, "OK", "3 of 3 frames, 2 m, 1 of the truth's length"),
+        ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), "OK", "2 m/s"),
+        ((0.0, None, 2.0), None, "WARN", "2 of 3 frames"),
+        ((0.0, 1.5, 3.0), None, "WARN", "1.5 of the truth's length"),
+        ((0.0, 1000.0, 2000.0), (0.0, 1.0, 2.0), "FAIL", "1e+03 m/s"),
+        ((0.0, 1.0, 2.0), (0.0, 0.0, 0.0), "OK", "2 m, "),
+    ],
+)
+def test_odometry_has_a_length_and_a_speed(z, times, level, words):
+    found = input_checks.judge_odometry(ahead(*z), ahead(0.0, 1.0, 2.0), times, range(3))
+    assert found.level == level
+    assert words in found.text
+    assert input_checks.judge_odometry(None, None, times, range(3)) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "words"),
+    [
+        ({}, "OK", "6 rows, 5 of them while the images were taken, 4 m, 2 m/s; standard deviation 0.1 m"),
+        ({"times": [100.0 + k for k in range(6)]}, "WARN", "0 of them"),
+        ({"sigma": [9.0, 9.0, 1.0]}, "WARN", "9 x 1 m"),
+        ({"positions": [[1000.0 * k, 0.0] for k in range(6)]}, "FAIL", "2e+03 m/s"),
+    ],
+)
+def test_positions_are_counted_within_the_time_of_the_images(change, level, words):
+    measured = {"times": [0.5 * k for k in range(6)], "positions": [[k, 0.0] for k in range(6)], "sigma": [0.1] * 3}
+    found = input_checks.judge_positions({**measured, **change}, (0.0, 1.0, 2.0), range(3))
+    assert found.level == level
+    assert words in found.text
+    assert input_checks.judge_positions(None, None, range(3)) is None
+
+
 def test_up_points_up():
     assert input_checks.judge_up(None, [0]) is None
     assert input_checks.judge_up([(0.0, -1.0, 0.0)], [0]).level == "OK"

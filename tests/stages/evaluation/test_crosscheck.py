@@ -99,6 +99,34 @@ def test_poses_are_metric_and_repeat_bit_by_bit(scene: Any) -> None:
     assert np.degrees(angles_between(out["poses"], true)).max() < 2 * 0.02
 
 
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(300.0, 300.0, -20.5, 119.5, 140, 240),  # its images were cut out of larger ones
+        Camera(300.0, 300.0, 159.5, 250.5, 140, 240),
+        Camera(4000.0, 4000.0, 159.5, 119.5, 320, 240),
+    ],
+)
+def test_cameras_that_colmap_registers_no_images_of(camera: Camera) -> None:
+    rng = np.random.default_rng(0)
+    rig = Rig(camera, camera, RigidTransform(np.eye(3), [-max(0.3, camera.fx / 4000), 0.0, 0.0]))
+    seen_at = rng.uniform([0, 0], [camera.width, camera.height], (400, 2))
+    points = camera.rays(seen_at) * rng.uniform(3.0, 9.0, 400)[:, None] * max(1.0, camera.fx / 800)
+    descriptors = rng.uniform(0, 1, (400, 128)).astype(np.float32) ** 3
+    descriptors *= 512 / np.linalg.norm(descriptors, axis=1, keepdims=True)
+    images: dict[str, list[Bundle]] = {"left": [], "right": []}
+    poses = [RigidTransform(np.eye(3), [0.05 * k, 0.0, 0.1 * k]) for k in range(3)]
+    for pose in poses:
+        for side, T in (("left", RigidTransform.identity()), ("right", rig.T_right_left)):
+            at = camera.project((T @ pose.inverse()).apply(points))
+            inside = ((at > 0) & (at < [camera.width, camera.height])).all(axis=1)
+            found = {"points": (at[inside] + 0.5).astype(np.float32), "descriptors": descriptors[inside]}
+            images[side].append(Bundle(found, {}))
+    out = crosscheck_stage.run(PARAMS, {"frames": [0, 1, 2], "rig": rig.to_dict()}, images)
+    true = np.array([T.matrix34 for T in poses])
+    assert np.linalg.norm(out["poses"][:, :, 3] - true[:, :, 3], axis=1).max() < 1e-3
+
+
 def test_a_wrong_rig_is_held_not_repaired(scene: Any) -> None:
     """Half a degree of roll puts rows of the right camera off by 1.3 px at the rim: it must stay in the residuals."""
     inputs = {side: bundles[:3] for side, bundles in scene[1].items()}

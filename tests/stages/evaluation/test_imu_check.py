@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rille.stages.evaluation.imu_check import of_gravity, of_rotations
+from rille.stages.evaluation.imu_check import of_rotations, of_vertical
 
 AXES = Rotation.from_rotvec([0.02, 0.03, 1.55]).as_matrix()
 TIMES = 0.1 * np.arange(25)
@@ -65,16 +65,39 @@ def test_a_right_sensor_never_contradicts_not_even_with_its_bias(speed):
     assert of_rotations(few, attitudes(read), TIMES, AXES) == []
 
 
+def pitched(*degrees: float) -> np.ndarray:
+    """Up of a camera that looks down by each of the angles, (n, 3)."""
+    return np.array([[0.0, -np.cos(p), -np.sin(p)] for p in np.deg2rad(degrees)])
+
+
 def test_gravity_off_the_ground_names_the_axes_that_would_fit():
     """As of a sensor whose x points up and z back, with x and z exchanged."""
     up = np.array([0.926, 0.013, -0.377])
-    (line,) = of_gravity(AXES.T @ up[[2, 1, 0]], AXES.T @ up, AXES)
+    (line,) = of_vertical((AXES.T @ up[[2, 1, 0]])[None], (AXES.T @ up)[None], AXES)
     assert "its z, y, x" in line
     assert "gravity alone does not tell" in line
     assert "134 degrees" in line
 
 
 def test_a_stated_vertical_off_the_ground_is_named():
-    up = np.array([0.0, -1.0, 0.0])
-    (line,) = of_gravity(-up, up, None)
+    (line,) = of_vertical(-pitched(0.0), pitched(0.0), None)
     assert "stated vertical is 180 degrees off" in line
+    (line,) = of_vertical(pitched(12.0, 8.0), pitched(-12.0, -8.0), None)
+    assert "stated vertical is 20 degrees off" in line
+    # Slopes to both sides are those of the ground.
+    assert of_vertical(pitched(0.0, 0.0), pitched(20.0, -20.0), None) == []
+
+
+@pytest.mark.parametrize(
+    ("stated", "seen", "words"),
+    [
+        (-12.0, (11.0, 12.0), "looks down by 11.5 degrees; with the other sign it is 0.5 off"),
+        (30.0, (11.0, 12.0), "looks down by 11.5 degrees; correct or remove it"),
+        (-3.0, (4.0, 3.0), "with the other sign it is"),
+    ],
+)
+def test_a_pitch_off_the_ground_is_named_and_the_sign_that_would_fit(stated, seen, words):
+    (line,) = of_vertical(pitched(*[stated] * len(seen)), pitched(*seen), None, np.deg2rad(stated))
+    assert f"world.pitch_deg = {stated:.3g} contradicts" in line
+    assert words in line
+    assert of_vertical(pitched(*seen), pitched(*[s + 4.0 for s in seen]), None, np.deg2rad(seen[0])) == []

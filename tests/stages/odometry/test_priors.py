@@ -6,11 +6,12 @@ from test_adjust import errors, run_of
 
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.sensors import OwnTrajectory, RelativePrior, departure, resampled
 
 TIMES = 0.1 * np.arange(31)
-BASE = {"times": TIMES.tolist(), "timed": True, "georeferenced": True}
+BASE = {"times": TIMES.tolist(), "timed": True, "georeference": {"origin": [-1e6, 0.0, 0.0], "azimuth": 0.0}}
 AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 TURNED = rotation_exp([0.0, np.deg2rad(10.0), 0.0])
 
@@ -212,11 +213,44 @@ def test_positions_that_lengthen_the_cameras_ways_are_said_to(scale):
 def test_positions_say_where_the_world_lies():
     truth, rng = winding(), np.random.default_rng(6)
     segments, before = run_of(truth, rng)
-    out = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeferenced": False})
+    out = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": None})
     place = out.meta["priors"]["place"]
     assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+@pytest.mark.parametrize(("east", "turn", "named"), [(0.0, 0.0, 0), (1.0, 0.0, 1), (0.0, 1.5, 1), (5e4, 30.0, 0)])
+def test_positions_contradict_a_stated_place(east, turn, named):
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    place = {"origin": [4.5e5 + east, 5.4e6, 300.0], "azimuth": np.deg2rad(turn) - 1.0}
+    lines = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": place}).meta["warnings"]
+    assert len([line for line in lines if "contradict the stated place" in line]) == named
+
+
+@pytest.mark.parametrize("lean", [0.0, 1.0])
+def test_positions_show_that_the_world_leans(lean):
+    truth, rng = winding(), np.random.default_rng(7)
+    segments, before = run_of(truth, rng)
+    turn = RigidTransform(rotation_exp([np.deg2rad(lean), 0.0, 0.0]), np.zeros(3))
+    out = adjusted(segments, before, gnss([turn @ T for T in truth], rng, sigma=0.02))
+    said = [line for line in out.meta["warnings"] if "the world leans by" in line]
+    assert len(said) == bool(lean)
+    if said:
+        up = [float(word) for word in said[0].split("[")[-1].split("]")[0].split(",")]
+        np.testing.assert_allclose(up, (turn @ truth[0]).rotation[2], atol=0.005)
+
+
+def test_positions_are_not_compared_where_nothing_tells_of_the_vertical():
+    truth, rng = winding(), np.random.default_rng(8)
+    segments, before = run_of(truth, rng)
+    turn = RigidTransform(rotation_exp([np.pi / 2, 0.0, 0.0]), np.zeros(3))
+    given = gnss([turn @ T for T in truth], rng, sigma=0.02)
+    before.meta["verticals"] = [NO_VERTICAL]
+    said = [line for line in adjusted(segments, before, given).meta["warnings"] if "[positions]" in line]
+    assert len(said) == 1
+    assert "world.up" in said[0]
 
 
 def test_how_the_frame_of_positions_is_turned_changes_nothing():

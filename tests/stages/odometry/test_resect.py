@@ -364,6 +364,22 @@ def test_a_frame_that_cannot_be_posed_is_lost_and_the_next_one_is_posed():
     np.testing.assert_allclose(found.poses[3], steps[3].matrix34, atol=1e-5)
 
 
+@pytest.mark.parametrize("larger", [0.02, -0.05, 0.3])
+def test_a_frame_with_another_focal_length_is_lost_and_says_so(larger):
+    rng = np.random.default_rng(23)
+    steps = [RigidTransform(rotation_exp([0, 0.02 * i, 0]), np.array([0.02 * i, 0, 0.3 * i])) for i in range(4)]
+    landmarks = scene(rng, 120, near=4.0, far=30.0)
+    points = np.stack([seen(T, landmarks) for T in steps], 1)
+    points += rng.normal(0.0, 0.2, points.shape)
+    points[:, 2] += larger * (points[:, 2] - [CAMERA.cx, CAMERA.cy])
+    _, found = segment_poses(points.astype(np.float32), landmarks, steps[0], [4, 5, 6, 7])
+    assert [k for k, fact in enumerate(found.facts) if "lost" in fact] == [2]
+    words = found.facts[2]["lost"]
+    assert words.startswith("the focal length changed by some ")
+    assert float(words.split()[6]) == pytest.approx(100.0 * larger, abs=0.3)
+    np.testing.assert_allclose(found.poses[3], steps[3].matrix34, atol=0.02)
+
+
 def test_solver_stands_still_on_singular_data():
     """One landmark seen many times: the damping keeps the step finite."""
     one = np.tile([[0.0, 0.0, 5.0]], (8, 1))

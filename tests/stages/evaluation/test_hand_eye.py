@@ -1,0 +1,77 @@
+"""Truth whose body is mounted otherwise than stated: the constant turn and shift are found, and nothing else is."""
+
+from __future__ import annotations
+
+import ast
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import Bundle, NoParams
+from rille.stages.evaluation.accuracy import accuracy_stage
+from rille.stages.evaluation.hand_eye import hand_eye
+from rille.stages.geometry import rigid
+from rille.stages.geometry.geometry import RigidTransform
+
+OFF = np.column_stack([Rotation.from_rotvec([0.02, -0.06, 0.03]).as_matrix(), [0.04, -0.02, 0.03]])
+"""What the mounting does not say: 4 degrees and 54 mm."""
+
+
+def flight(seed: int, turn: float = 0.15, frames: int = 30) -> Floats:
+    """T_world_left (frame, 3, 4) of 10 m, turned by some ``turn`` radians from frame to frame."""
+    rng = np.random.default_rng(seed)
+    angles = np.cumsum(rng.normal(0.0, turn, (frames, 3)), axis=0)
+    R = Rotation.from_rotvec(angles).as_matrix()
+    return np.concatenate([R, np.cumsum(R @ [0.02, 0.03, 0.3], axis=0)[:, :, None]], axis=2)
+
+
+def estimated(true: Floats, seed: int) -> Floats:
+    """With errors of a millimetre and .05 degrees a frame, which add up."""
+    rng = np.random.default_rng(seed)
+    R = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.001, (len(true), 3)), axis=0)).as_matrix() @ true[:, :, :3]
+    off = np.cumsum(rng.normal(0.0, 0.001, (len(true), 3)), axis=0)
+    return np.concatenate([R, (true[:, :, 3] + off)[:, :, None]], axis=2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_constant_turn_and_shift_are_found(seed: int) -> None:
+    true = flight(seed)
+    found = hand_eye(estimated(true, seed), rigid.compose(true, rigid.inverse(OFF)))
+    assert found is not None
+    assert float(rigid.angle(rigid.compose(rigid.inverse(OFF), found))) < 0.006
+    np.testing.assert_allclose(found[:, 3], OFF[:, 3], atol=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_of_the_estimate_are_no_turn_of_the_truth(seed: int) -> None:
+    true = flight(seed)
+    assert hand_eye(estimated(true, seed), true) is None
+    assert hand_eye(true, true) is None
+
+
+def test_a_small_turn_of_a_straight_drive_is_not_told_from_the_camera() -> None:
+    true = flight(1, turn=0.0)
+    small = np.column_stack([Rotation.from_rotvec([0.0, 0.005, 0.0]).as_matrix(), np.zeros(3)])
+    assert hand_eye(estimated(true, 1), rigid.compose(true, small)) is None
+
+
+def test_figures_without_it_stand_beside_those_as_given() -> None:
+    true = flight(7)
+    poses = estimated(true, 7)
+    frames = list(range(len(true)))
+    covariance = np.tile(1e-5 * np.eye(6), (len(true), 1, 1))
+    trajectory = Bundle({"poses": poses, "covariance": covariance}, {"frames": frames})
+    mount = RigidTransform(Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix(), np.array([0.1, 0.0, 0.0]))
+    given = rigid.compose(true, rigid.inverse(OFF)).reshape(-1, 12).tolist()
+    facts = accuracy_stage(NoParams(), trajectory, frames=frames, truth=given, mount=mount).meta
+    value = {name: figure["value"] for name, figure in facts["metrics"].items()}
+    assert value["hand_eye_turn"] == pytest.approx(4.0, abs=0.3)
+    assert value["hand_eye_shift"] == pytest.approx(0.054, abs=0.01)
+    assert value["ate_rmse"] > 1.5 * value["hand_eye_ate_rmse"]
+    assert value["hand_eye_nees"] < 0.1 * value["nees"]
+    [line] = facts["warnings"]
+    assert line.startswith("the truth's body is turned by 3.9 degrees and shifted by 0.05")
+    stated = np.array(ast.literal_eval(line.split("truth.T_body_left = ")[1]))
+    np.testing.assert_allclose(stated, rigid.compose(mount.matrix34, OFF), atol=0.02)
