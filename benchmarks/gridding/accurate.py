@@ -10,8 +10,8 @@ import numpy as np
 from rille.pipeline.flow import config
 from rille.stages.core.validity import matched_back
 from rille.stages.hfvm.stage import match
-from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
+from rille.stages.terrain.matches import Matches
 
 from .scenes import Scene
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from rille.stages.terrain.locus import refinement, solve, uncertainty
-from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.solve import LocusParams
 from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
+from rille.stages.terrain.matches import Matches
 
 SEEDS = {"chosen": (1, 2, 3), "judged": (4, 5, 6)}
 FRAMES = (0, 6)

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.terrain.locus.solve import MAX_JUMP_PX, LocusParams, Matches
+from rille.stages.terrain.locus.solve import MAX_JUMP_PX, LocusParams
 from rille.stages.terrain.locus.stage import MatchedPair, reconstruct
+from rille.stages.terrain.matches import Matches
 
 from .mesh import rasterise, without_jumps
 from .scenes import Scene, pixels_of

@@ -121,8 +121,9 @@ def simulated(sequence: Any, fetch: Any, frame: int) -> Scene:
 
 def _searched(rig: Rig, found: Disparities, up: Floats, lattice: Lattice) -> tuple[float, float]:
     from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
+    from rille.stages.terrain.matches import Matches
 
-    facts = level(found.column, found.row, found.measured, rig, GroundFrameParams(), VerticalHint(up=up))
+    facts = level(Matches(found.column, found.row, found.measured), rig, GroundFrameParams(), VerticalHint(up=up))
     low, high = z_range(facts["plane"], facts["relief"], list(lattice.bounds))
     return low, high
 

@@ -28,8 +28,9 @@ from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.hfvm.stage import match
 from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.ground_frame import GroundFrameParams, VerticalHint, level, z_range
-from rille.stages.terrain.locus.solve import LocusParams, Matches
+from rille.stages.terrain.locus.solve import LocusParams
 from rille.stages.terrain.locus.stage import MatchedPair, local_lattice, reconstruct
+from rille.stages.terrain.matches import Matches
 
 Floats32 = NDArray[np.float32]
 
@@ -144,7 +145,7 @@ def _reconstructed(
     """Lattice, frame and range of elevations, and elevations with their standard deviation, by a vertical."""
     given = pair.matches(pair.forth)
     usable = matched_back(pair.forth.validity, pair.forth.backmatch_error)
-    facts = level(given.column, given.row, usable, pair.rig, GroundFrameParams(), VerticalHint(up=up))
+    facts = level(Matches(given.column, given.row, usable), pair.rig, GroundFrameParams(), VerticalHint(up=up))
     T_local_left = RigidTransform.from_matrix(facts["T_local_left"])
     view = view_ground(pair.rig, T_local_left.rotation, facts["plane"])
     lattice = lattice or local_lattice(view, CELL, pair.params)

@@ -18,14 +18,12 @@ from pydantic import TypeAdapter
 
 from rille.pipeline.engine.plain import brief
 from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.stages.core.errors import told
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
     from rille.pipeline.engine.store.base import Store
     from rille.pipeline.engine.store.manifest import Ref
-
-SHOWN = 3
-"""Largest number of differences stated for a node."""
 
 Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""
@@ -72,8 +70,7 @@ class History:
         # The nearest of the earlier ones: a user who goes back to former settings sees what is new, not what was
         # undone.
         found = min((differences(then, now) for then in earlier), key=len)
-        shown = found[:SHOWN] + ([f"and {len(found) - SHOWN} more"] if len(found) > SHOWN else [])
-        return "; ".join(shown) or "the key has another format"
+        return told(found) or "the key has another format"
 
     def latest(self, handle: Handle) -> Ref | None:
         """The latest artifact of a stage and label that is still there, whatever it was made from."""

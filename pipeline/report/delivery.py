@@ -28,9 +28,6 @@ Items = list[dict[str, str]]
 HARMLESS = ("no path", "crosscheck")
 """Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
 
-MIN_OFF_MAP = 0.1
-"""Share of the matched pixels from which on it is said that limits keep them off the map."""
-
 
 def is_complete(missing: Items) -> bool:
     """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
@@ -223,7 +220,8 @@ def coverage(view: RunView) -> list[str]:
     maps = {pair: facts_of(view, dem).get("coverage", {}) for pair, dem in view.products.local_dem.items()}
     lacking = {pair: facts["outside"] + facts["unsure"] for pair, facts in maps.items() if facts.get("settings")}
     pair = max(lacking, key=lambda k: lacking[k], default=-1)
-    if lacking.get(pair, 0.0) < MIN_OFF_MAP:
+    # Shares of the matched pixels.
+    if lacking.get(pair, 0.0) < 0.1:
         return []
     facts, size = maps[pair], [metres(v) for v in maps[pair]["size"]]
     settings = " ".join(f"--set {name}={value:g}" for name, value in facts["settings"].items())

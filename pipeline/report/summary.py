@@ -186,16 +186,13 @@ def _sensors(view: RunView) -> list[str]:
     return lines
 
 
-MAX_SIGMA_RATIO = 3.0
-"""Factor by which errors exceed their standard deviations from which on it is said."""
-
-
 def _small_sigma(figures: Mapping[str, Any]) -> list[str]:
     """The standard deviations of the poses are not to be weighed by, where truth says so."""
     off = {}
     for part in ("position", "rotation"):
         nees = _value(figures, f"trajectory_nees_{part}")
-        if nees is not None and nees > MAX_SIGMA_RATIO**2:
+        # Errors of three times their standard deviations are worth a word.
+        if nees is not None and nees > 3.0**2:
             off[part] = f"{part}s by about {number(math.sqrt(nees), 2)} times"
     if not off:
         return []

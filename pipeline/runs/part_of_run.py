@@ -41,8 +41,11 @@ def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
         raise ConfigError("RIL-034", "--until and --only are both given", remedy="give one of them")
     stages = set(config.stages(*FLOWS))
     refuse_unknown("--until", until, stages, "stage")
-    files = {output.name: output for output in catalogue.OUTPUTS if output.write is not None}
+    files = {output.name: output for output in catalogue.OUTPUTS}
     refuse_unknown("--only", only, files, "file")
+    for name in sorted(catalogue.RENDERED.intersection(only)):
+        text = f"--only {name}: each run writes that, of what it has made"
+        raise ConfigError("RIL-036", text, remedy="name the files to be made, or leave --only out")
     wanted = {*until, "output"}
     if until:
         return Cut(frozenset(until), lambda h: h.stage in wanted or h.label.partition("/")[0] in wanted)

@@ -38,14 +38,10 @@ SIZE = RIG + PRINCIPAL + len(TERMS)
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""
 
-NO_SHIFT_PX = 1e-3
-"""Standard deviation [pixels] of a principal point that is held as given."""
 
 EXACT_RAD = 1e-7
 """Standard deviation [rad] of a parameter that is held exactly."""
 
-NO_SMOOTH_PX = 3e-3
-"""RMS [pixels] of a smooth error that is held at none."""
 
 MIN_MATCHES = 50
 
@@ -147,7 +143,8 @@ def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: 
     The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
-    none = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD, systematic=NO_SMOOTH_PX)
+    # A smooth error that is as good as held at none.
+    none = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD, systematic=3e-3)
     return _adjust(rig, pairs, precision(free, none, rival=False))
 
 
@@ -202,7 +199,8 @@ def precision(free: Sequence[bool], priors: Priors, *, rival: bool) -> Floats:
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
     for angle, coordinate in PARTNERS:
         if free[angle] and not rival:
-            sigma[RIG + coordinate] = NO_SHIFT_PX
+            # As good as held as given.
+            sigma[RIG + coordinate] = 1e-3
     return np.diag(sigma**-2.0)
 
 

@@ -53,12 +53,6 @@ from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
 from rille.stages.numeric.robust import mad_sigma
 
-MAX_MATCHES = 10_000
-"""Most matches of all pairs together: with more, systematic errors dominate."""
-
-MIN_MATCHES_OF_PAIR = 200
-"""Matches of a pair that count at least, however many pairs there are."""
-
 BAD_ROWS_PX = 1.0
 """Residual [pixels of the coarser image] after the repair from which on it is doubted: RMS of all pairs, lens
 distortion or a wrong calibration; spread of one, its images may be of two moments."""
@@ -164,7 +158,8 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
 
 def _share(pairs: list[PointPairs]) -> list[PointPairs]:
     """Every so manieth match of each pair, so that many pairs together stay affordable."""
-    most = max(MIN_MATCHES_OF_PAIR, MAX_MATCHES // len(pairs))
+    # With more than 10 000 matches systematic errors dominate; 200 of a pair count at least.
+    most = max(200, 10_000 // len(pairs))
     steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
     return [PointPairs(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 

@@ -18,9 +18,6 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
 
-MAX_SPREAD_SHARE = 0.5
-"""Another right image explains the rows where their spread is below this share of the spread as named."""
-
 MIN_SPREAD_PX = 1.0
 """Pixels of spread as named, below which no other image is looked for; matches within are on their lines."""
 
@@ -50,7 +47,8 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> Synchro
         # Many on their lines, not a small spread: far away in time only things match that hardly move in the image.
         other = max(known, key=lambda frame: int((np.abs(known[frame]) < MIN_SPREAD_PX).sum()))
         rows.append(mad_sigma(known[pair]))
-        if rows[-1] > MIN_SPREAD_PX and mad_sigma(known[other]) < MAX_SPREAD_SHARE * rows[-1]:
+        # Another right image explains the rows where their spread is half of that as named.
+        if rows[-1] > MIN_SPREAD_PX and mad_sigma(known[other]) < 0.5 * rows[-1]:
             partners[pair] = other
     facts: SynchronyFacts = {"rows": rows, "partners": [list(item) for item in partners.items()]}
     if partners:

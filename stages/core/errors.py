@@ -52,11 +52,7 @@ class DegenerateError(RilleError, ArithmeticError):
     """The data do not determine the answer (too few landmarks, no texture, no baseline ...)."""
 
 
-TOLD = 3
-"""Complaints of one kind in a message; whoever mends them sees the next."""
-
-
-def told(complaints: Sequence[Any], words: Callable[[Any], str]) -> str:
-    """The first complaints in words, and how many more there are."""
-    more = [f"and {len(complaints) - TOLD} more"] if len(complaints) > TOLD else []
-    return "; ".join([*map(words, complaints[:TOLD]), *more])
+def told(complaints: Sequence[Any], words: Callable[[Any], str] = str) -> str:
+    """Three complaints of one kind in words, and how many more there are: whoever mends them sees the next."""
+    more = [f"and {len(complaints) - 3} more"] if len(complaints) > 3 else []
+    return "; ".join([*map(words, complaints[:3]), *more])

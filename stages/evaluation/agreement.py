@@ -23,24 +23,12 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.rigid import rms
 from rille.stages.numeric.robust import mad_sigma
 
-ORIENTATION_SHARE = 0.1
-"""Positions decide the alignment, as in an absolute trajectory error; orientations only where positions cannot."""
-
 REST = 10.0
 """Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
 determine no rotation."""
 
 MIN_SIGMAS, MIN_RATIO = 5.0, 2.0
 """Robust standard deviations above the median, and multiple of the median, below which no frame is flagged."""
-
-MIN_ANGLE_DEG = 0.05
-"""Rotation difference below which no frame is flagged: one pixel at a focal length of 1100."""
-
-MIN_DISTANCE_M = 1e-9
-"""Disagreement below which no frame is flagged: rounding is no reason."""
-
-MIN_LINE_DISTANCE_PX = 1.0
-"""Median distance of a frame's matches from their epipolar lines below which it is not flagged."""
 
 
 class Reason(NamedTuple):
@@ -52,13 +40,14 @@ class Reason(NamedTuple):
 
 
 REASONS: Mapping[str, Reason] = {
-    "distance": Reason(1, "position", MIN_DISTANCE_M),
-    "angle": Reason(2, "rotation", math.radians(MIN_ANGLE_DEG)),
-    "step_distance": Reason(4, "motion since the frame before", MIN_DISTANCE_M),
-    "step_angle": Reason(8, "rotation since the frame before", math.radians(MIN_ANGLE_DEG)),
-    "line_distance": Reason(16, "left and right image do not fit the rig", MIN_LINE_DISTANCE_PX),
+    "distance": Reason(1, "position", 1e-9),
+    "angle": Reason(2, "rotation", math.radians(0.05)),
+    "step_distance": Reason(4, "motion since the frame before", 1e-9),
+    "step_angle": Reason(8, "rotation since the frame before", math.radians(0.05)),
+    "line_distance": Reason(16, "left and right image do not fit the rig", 1.0),
 }
-"""Reasons by the array (frame,) that they are judged by."""
+"""Reasons by the array (frame,) that they are judged by. Less than 1e-9 m is rounding; 0.05 degrees are a pixel at a
+focal length of 1100 pixels."""
 
 
 def compare(
@@ -93,8 +82,9 @@ def compare(
         arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
         arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
-        # A camera at rest: its positions are noise, and would turn the alignment to any side.
-        share = math.inf if rests else ORIENTATION_SHARE
+        # A camera at rest: its positions are noise, and would turn the alignment to any side. Otherwise positions
+        # decide it, as in an absolute trajectory error.
+        share = math.inf if rests else 0.1
         laid[piece == number] = rigid.compose(rigid.alignment(theirs[rows], ours[rows], share), theirs[piece == number])
         if not rests:
             both = np.stack([laid[rows, :, 3], ours[rows, :, 3]])
@@ -201,9 +191,10 @@ def agreement_stage(
         "pieces": len(crosscheck.meta["pieces"]),
         "metrics": figures,
         "rule": f"disagreement above the median by more than {MIN_SIGMAS:g} robust standard deviations "
-        f"(1.4826 MAD), and above {MIN_RATIO:g} medians; in position, rotation (from {MIN_ANGLE_DEG:g}° on), or the "
-        f"motion since the frame before; or matches of left and right as far (from {MIN_LINE_DISTANCE_PX:g} px on) "
-        "from their epipolar lines",
+        f"(1.4826 MAD), and above {MIN_RATIO:g} medians; in position, rotation (from "
+        f"{math.degrees(REASONS['angle'].least):g}° on), or the "
+        "motion since the frame before; or matches of left and right as far "
+        f"(from {REASONS['line_distance'].least:g} px on) from their epipolar lines",
         "limits": {n: v if v is None or "angle" not in n else math.degrees(v) for n, v in limits.items()},
         "flagged": [
             {"frame": f, "why": [reason.words for reason in REASONS.values() if bits & reason.bit]}

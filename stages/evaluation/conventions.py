@@ -23,8 +23,6 @@ from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms,
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
 MIN_SHARE = 1e-6
-# Extent of a trajectory over the standard deviation of its positions, below which the camera is as good as at rest.
-MIN_EXTENT_SIGMAS = 5.0
 # Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
 # reading leaves at most.
 MIN_MISFIT, MAX_SHARE = 0.02, 0.4
@@ -76,7 +74,8 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     """
     chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
     P, Q, mount = estimate[chosen], truth[chosen], T_body_left.matrix34
-    if len(P) < MIN_FRAMES or spread(P) < max(MIN_EXTENT_SIGMAS * sigma, 1e-6):
+    # An extent of a few standard deviations is that of a camera at rest.
+    if len(P) < MIN_FRAMES or spread(P) < max(5.0 * sigma, 1e-6):
         return []
     if spread(Q) < MIN_SHARE * spread(P):
         return [f"the truth rests, the trajectory extends {spread(P):.3g} m: is it the right file, and does it go on?"]

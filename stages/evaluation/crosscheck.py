@@ -34,9 +34,6 @@ OVERLAP = 3
 """Frames common to successive windows; they join the windows."""
 
 
-NEAR_ANGLE_DEG = 1.5
-"""Triangulation angle below which COLMAP drops a point: it registers the next images by the nearer ones alone."""
-
 SEED = 0
 """Of COLMAP's random sampling."""
 
@@ -186,7 +183,8 @@ def _near(rig: Rig, left: Floats, right: Floats) -> int:
     """Number of the matches whose rays meet under an angle at which COLMAP keeps the point."""
     rays = rig.left.rays(left), rig.right.rays(right) @ rig.T_right_left.rotation
     cosine = (rays[0] * rays[1]).sum(axis=1) / np.prod([np.linalg.norm(r, axis=1) for r in rays], axis=0)
-    return int((cosine <= math.cos(math.radians(NEAR_ANGLE_DEG))).sum())
+    # COLMAP drops points seen under less than 1.5 degrees, and registers the next images by the nearer ones alone.
+    return int((cosine <= math.cos(math.radians(1.5))).sum())
 
 
 def _models(database: Any, starts: Mapping[int, int]) -> list[Any]:

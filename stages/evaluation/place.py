@@ -28,9 +28,6 @@ FEWEST, MOST_SCALE = 12, 0.03
 MAX_RATIO, MIN_CONTRAST = 1.5, 16.0
 """Of cells, above which the finer image is averaged; and of grey values: paler images are stretched."""
 
-FILL_CELLS = 4.0
-"""Width of the surroundings that unknown cells take their grey value from."""
-
 
 def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
     """Find where A lies in B, without a start, by the ortho images of both or else their elevations, all in metres.
@@ -114,7 +111,7 @@ def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     if low < 0 or high > 255 or high - low < MIN_CONTRAST:  # of other units, or pale
         grey = (grey - low) * (255.0 / max(high - low, 1e-12))
     # The edge of what is known is no texture: unknown cells get what is around them.
-    around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), FILL_CELLS) for v in (np.where(known > 0, grey, 0), known)]
+    around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), 4.0) for v in (np.where(known > 0, grey, 0), known)]
     grey = np.where(known > 0, grey, around[0] / np.maximum(around[1], 1e-6))
     # Without it keypoints lie a part of a cell off their places.
     sift = cv2.SIFT.create(8000, enable_precise_upscale=True)

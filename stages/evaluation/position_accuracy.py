@@ -57,9 +57,6 @@ MAX_TRIALS = 20000
 MAX_ERROR_SHARE = 0.5
 """Where other axes, another unit or a lever arm of the truth leave less than this share of the error, it is said."""
 
-MAX_LEVER_ARM_M = 5.0
-"""Of a large vehicle; more is an error of the track."""
-
 MEASURED_VERTICAL = "attitude"
 """Source of the vertical by which heights of truth and world have one direction; ground is not level."""
 
@@ -182,7 +179,8 @@ def position_accuracy(
     lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)
     before, after = (compared.metrics["position_rmse"]["value"] for compared in (without, fitted))
-    if not rank or np.linalg.norm(lever) > MAX_LEVER_ARM_M or after is None or after > MAX_ERROR_SHARE * before:
+    # That of a large vehicle is at most 5 m; more is an error of the track.
+    if not rank or np.linalg.norm(lever) > 5.0 or after is None or after > MAX_ERROR_SHARE * before:
         return without
     x, y, z = lever.round(3) + 0.0
     said = (

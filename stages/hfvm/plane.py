@@ -283,11 +283,6 @@ MAX_SIDE_PX = 1024
 MIN_CONTRAST = 0.02
 """Least contrast of a keypoint; half of OpenCV's default, for sand and haze."""
 
-MAX_KEYPOINTS = 4000
-"""Keypoints of an image: comparing all with all takes this many squared."""
-
-MAX_DISTANCE_RATIO = 0.8
-"""The nearest keypoint must be nearer by this factor than the second nearest (Lowe 2004)."""
 
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
@@ -325,7 +320,7 @@ def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np
     """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
-    sift = cv2.SIFT_create(nfeatures=MAX_KEYPOINTS, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
     points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
@@ -341,7 +336,8 @@ def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     back = [m.trainIdx for (m,) in matcher.knnMatch(b, a, k=1)]
     near = matcher.knnMatch(a, b, k=2)
-    kept = [m for m, n in near if m.distance < MAX_DISTANCE_RATIO * n.distance and back[m.trainIdx] == m.queryIdx]
+    # Lowe's (2004): the nearest keypoint is nearer by this factor than the second nearest.
+    kept = [m for m, n in near if m.distance < 0.8 * n.distance and back[m.trainIdx] == m.queryIdx]
     return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
 
 

@@ -71,8 +71,6 @@ WINDOW_RADIUS_PX = 2
 ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
-CORRELATION_SIDE_PX = 9
-"""Pixels: fewer do not tell correlated noise from texture."""
 
 MAX_CORRECTION_PX = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
@@ -289,7 +287,8 @@ def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tup
     known = keep & (rest < np.inf)
     nil = np.float32(0.0)
     planes = np.where(known, rest, nil), np.where(known, deviation * deviation, nil), known.astype(np.float32)
-    sums = tuple(window_sum32(plane, CORRELATION_SIDE_PX) for plane in planes)
+    # Fewer pixels do not tell correlated noise from texture.
+    sums = tuple(window_sum32(plane, 9) for plane in planes)
     correlation, around = np.empty_like(rest), np.empty_like(rest)
     _correlation(sums, (np.float32(noise[0]), np.float32(noise[0] + noise[1])), correlation, around)
     return correlation, around

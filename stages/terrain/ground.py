@@ -48,11 +48,21 @@ class GroundPlane:
 
 
 class Samples(NamedTuple):
-    """Rays (n, 3) with z = 1 of the left camera, inverse depths ``rho`` (n,) and their standard deviations, 1/m."""
+    """Sampled pixels of a pair's left camera.
+
+    ``rays`` (n, 3) with z = 1; inverse depths ``rho`` (n,) and their standard deviations ``sigma`` (n,), 1/m, by an
+    error of the disparity of ``sigma_px``; ``focal``, px, of the camera with the coarser pixels.
+    """
 
     rays: Floats
     rho: Floats
     sigma: Floats
+    sigma_px: float
+    focal: float
+
+    def take(self, which: Bools) -> Samples:
+        """Some of them."""
+        return self._replace(rays=self.rays[which], rho=self.rho[which], sigma=self.sigma[which])
 
 
 def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPlane:
@@ -67,7 +77,7 @@ def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPla
     DegenerateError
         No allowed plane holds a twentieth of the points.
     """
-    rays, rho, sigma = samples
+    rays, rho, sigma = samples.rays, samples.rho, samples.sigma
     if rays.shape[0] < MIN_POINTS:
         raise DegenerateError(
             "RIL-342",
@@ -99,7 +109,7 @@ MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with 
 
 def _consensus(samples: Samples, tolerance: Floats, allowed: Callable[[Floats], Bools]) -> Floats | None:
     """The allowed plane of most agreement among planes through three points; None: none is allowed."""
-    rays, rho, sigma = samples
+    rays, rho, sigma = samples.rays, samples.rho, samples.sigma
     # An all-ground sample of three is among a thousand (p > .999) where a fifth of the pixels are ground.
     triples = np.random.default_rng(1999).integers(0, rays.shape[0], size=(1000, 3))
     volume = np.abs(np.linalg.det(rays[triples]))
@@ -175,30 +185,27 @@ def rounded_cell(size: float) -> float:
 _125 = (1.0, 2.0, 5.0)
 
 
-def view_points(
-    samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float, slopes: Sequence[float] = (0.0, 0.0)
-) -> PlaneView:
+def view_points(samples: Samples, T_local_left: RigidTransform, slopes: Sequence[float] = (0.0, 0.0)) -> PlaneView:
     """View of a plane by points, each on a surface parallel to it: z = a x + b y of the local frame (``slopes`` a, b).
 
     On the ray r of a pixel (z = 1), which gains r . (-a, -b, 1) of height over the plane with each metre of depth,
     depth 1/rho with the error sigma / rho^2 has that part of it as error of elevation; and a pixel, 1 / (rho f) wide
-    there, covers as much of the plane over that gain. ``sigma_d``: pixels of disparity that ``sigma`` stands for.
+    there, covers as much of the plane over that gain.
     """
-    rays, rho, sigma = samples
+    rays, rho, sigma = samples.rays, samples.rho, samples.sigma
     gain = np.maximum(np.abs(rays @ (np.array([-slopes[0], -slopes[1], 1.0]) @ T_local_left.rotation)), 1e-3)
     # The range grows along the ray: beside the middle of the image longer than depth, and the width is across the ray.
     aside = np.hypot(1.0, rays @ T_local_left.rotation[0])
-    points, across = rays / rho[:, None], 1.0 / (rho * coarser_focal(rig) * aside)
+    points, across = rays / rho[:, None], 1.0 / (rho * samples.focal * aside)
     slant = np.asarray(np.linalg.norm(points, axis=1))
-    return PlaneView(
-        T_local_left.apply(points), slant, across * aside**2 / gain, across, sigma_d * rho**2 / (sigma * gain)
-    )
+    slope = samples.sigma_px * rho**2 / (sigma * gain)
+    return PlaneView(T_local_left.apply(points), slant, across * aside**2 / gain, across, slope)
 
 
-def view_matches(samples: Samples, rig: Rig, T_local_left: RigidTransform, sigma_d: float) -> PlaneView:
-    """View of the plane z = 0 of the local frame by matched pixels; ``sigma_d`` as in :func:`view_points`."""
-    near = samples.rho > MIN_DEPTH_SIGMAS * samples.sigma
-    return replace(view_points(Samples(*(values[near] for values in samples)), rig, T_local_left, sigma_d), stray=0.005)
+def view_matches(samples: Samples, T_local_left: RigidTransform) -> PlaneView:
+    """View of the plane z = 0 of the local frame by matched pixels."""
+    near = samples.take(samples.rho > MIN_DEPTH_SIGMAS * samples.sigma)
+    return replace(view_points(near, T_local_left), stray=0.005)
 
 
 def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> PlaneView:
@@ -226,5 +233,5 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Plane
             remedy="check the pitch, the left/right order and T_right_left",
         )
     _, per_pixel = inverse_depth(rig, pixels[in_both], (right - pixels)[in_both])
-    level = RigidTransform(R_local_left, np.zeros(3))
-    return view_points(Samples(rays[in_both], rho[in_both], per_pixel), rig, level, 1.0, (a, b))
+    samples = Samples(rays[in_both], rho[in_both], per_pixel, 1.0, coarser_focal(rig))
+    return view_points(samples, RigidTransform(R_local_left, np.zeros(3)), (a, b))

@@ -18,16 +18,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import inverse_depth
@@ -46,6 +45,7 @@ from rille.stages.terrain.ground import (
     view_ground,
     view_matches,
 )
+from rille.stages.terrain.matches import Matches
 
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
@@ -79,9 +79,7 @@ class VerticalHint(NamedTuple):
 
 
 def level(
-    column_disparity: ArrayLike,
-    row_disparity: ArrayLike,
-    usable: Bools,
+    matches: Matches,
     rig: Rig,
     params: GroundFrameParams,
     vertical: VerticalHint | None = None,
@@ -91,8 +89,7 @@ def level(
 
     Parameters
     ----------
-    column_disparity, row_disparity : (rows, cols) right minus left, pixels, of the left image.
-    usable : (rows, cols) pixels with a measured disparity.
+    matches : of the left image.
     vertical : None: it is that of the ground.
     reference : None: the ground; :data:`SCENE`: the scene's own plane; otherwise normal and point (6,) of a plane in
         the left camera's frame, m.
@@ -102,18 +99,16 @@ def level(
     DegenerateError
         Left and right seem swapped, the rig has no baseline, or nothing is matched that a plane is fitted to.
     """
-    maps = np.asarray(column_disparity), np.asarray(row_disparity)
-    samples = sampled(maps, usable, rig, params.sigma_disparity)
+    samples = sampled(matches, rig, params.sigma_disparity)
     if reference is not None:
         stated = scene_plane(samples) if isinstance(reference, str) else stated_plane(reference)
-        return _on_plane(stated, samples, rig, params.sigma_disparity)
+        return _on_plane(stated, samples)
     known_up, source = _given_vertical(vertical or VerticalHint())
-    rays, rho, sigma = samples
-    ground = None
+    rays, rho, ground = samples.rays, samples.rho, None
     try:
         ground = fit_plane(samples, lambda n: _allowed(n, known_up))
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
-        return _on_ground(ground, R_local_left, samples, rig, params.sigma_disparity, source or GROUND_PLANE)
+        return _on_ground(ground, R_local_left, samples, rig, source or GROUND_PLANE)
     except DegenerateError as error:
         why, other = _explained(error, samples, ground)
     up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
@@ -122,7 +117,7 @@ def level(
     try:
         if params.reference_height is not None:
             stated = GroundPlane(up, params.reference_height)
-            return _on_ground(stated, R_local_left, samples, rig, params.sigma_disparity, source)
+            return _on_ground(stated, R_local_left, samples, rig, source)
     except DegenerateError as error:
         why = error
     facts: GroundFacts = {
@@ -130,7 +125,7 @@ def level(
         "source": source,
         "plane": None,
         "relief": None,
-        "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * sigma], rig),
+        "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * samples.sigma], rig),
         "footprint": None,
         "ground_share": 0.0,
         "no_ground": str(why),
@@ -170,14 +165,12 @@ def _explained(
     return DegenerateError(error.code, message, remedy=remedy), seen
 
 
-def _on_ground(
-    ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, sigma_disparity: float, source: str
-) -> GroundFacts:
+def _on_ground(ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, source: str) -> GroundFacts:
     """What :func:`level` says of a pair whose ground plane is known."""
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
-    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, sigma_disparity, cell)
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, cell)
     points = (samples.rays / np.maximum(samples.rho, 1e-12)[:, None]) @ R_local_left.T
     relief = _relief(points[samples.rho > 0], plane, footprint, ground.height)
     return {
@@ -197,7 +190,7 @@ def scene_plane(samples: Samples) -> GroundPlane:
 
     Across the view, elevations are a depth map: whatever the scene is, each matched pixel has its own place there.
     """
-    rays, rho, _ = samples
+    rays, rho = samples.rays, samples.rho
     if not len(rays):
         remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
@@ -225,20 +218,20 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
     return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height))
 
 
-def _on_plane(reference: GroundPlane, samples: Samples, rig: Rig, sigma_disparity: float) -> GroundFacts:
+def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
     """What :func:`level` says of a pair whose reference plane is no ground."""
     z = reference.up
     # Along the plane, right in the image; for a plane that holds that direction's normal alone, along the optical axis.
     right = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
     x = (right - (right @ z) * z) / np.linalg.norm(right - (right @ z) * z)
     T_local_left = RigidTransform(np.array([x, np.cross(z, x), z]), np.array([0.0, 0.0, reference.height]))
-    view = view_matches(samples, rig, T_local_left, sigma_disparity)
+    view = view_matches(samples, T_local_left)
     if not len(view.slant):
         raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
     cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
     # A match so uncertain has a hundredth of the median one's weight.
-    max_sigma = float(f"{10.0 * np.median(sigma_disparity / view.slope):.2g}")
-    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, sigma_disparity, max_sigma)
+    max_sigma = float(f"{10.0 * np.median(samples.sigma_px / view.slope):.2g}")
+    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, max_sigma)
     relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, RELIEF_MARGIN_SHARE * reference.height)
     return {
         "T_local_left": T_local_left.to_list(),
@@ -266,9 +259,9 @@ def z_range(plane: list[float], relief: list[float], extent: list[float]) -> lis
     return [min(corners) + relief[0], max(corners) + relief[1]]
 
 
-def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, sigma_disparity: float) -> Samples:
-    """Rays, inverse depths and their errors at a regular sparse grid of usable pixels; ``maps``: both disparities."""
-    column, row = maps
+def sampled(matches: Matches, rig: Rig, sigma_px: float) -> Samples:
+    """Samples at a regular sparse grid of usable pixels; ``sigma_px``: standard deviation of a disparity."""
+    column, row, usable = np.asarray(matches.column), np.asarray(matches.row), matches.usable
     rig.check(column.shape)
     # Some 5000 of them: three parameters need no more.
     step = max(1, int(math.sqrt(column.size / 10_000)))
@@ -277,11 +270,11 @@ def sampled(maps: tuple[NDArray[Any], NDArray[Any]], usable: Bools, rig: Rig, si
     pixels = np.stack([c, r], axis=-1).astype(np.float64)
     disparity = np.stack([column[r, c], row[r, c]], axis=-1).astype(np.float64)
     rho, per_pixel = inverse_depth(rig, pixels, disparity)
-    sigma = per_pixel * sigma_disparity
+    sigma = per_pixel * sigma_px
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
         refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
-    return Samples(rig.left.rays(pixels), rho, sigma)
+    return Samples(rig.left.rays(pixels), rho, sigma, sigma_px, coarser_focal(rig))
 
 
 def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
@@ -347,15 +340,8 @@ def ground_frame_stage(
     why: str | None = None,
 ) -> Bundle[GroundFacts]:
     """Vertical and reference plane of a basic pair; ``why``: the reason for a reference that is no ground."""
-    facts = level(
-        disparity["column_disparity"],
-        disparity["row_disparity"],
-        matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"])),
-        Rig.from_dict(rig.meta["rig"]),
-        params,
-        VerticalHint(up, pitch),
-        reference,
-    )
+    given = Rig.from_dict(rig.meta["rig"])
+    facts = level(Matches.of(disparity), given, params, VerticalHint(up, pitch), reference)
     if why is not None:
         facts["why"] = why
     return Bundle({}, facts)

@@ -16,13 +16,11 @@ import numpy as np
 from pydantic import Field
 
 from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.core.errors import told
 from rille.stages.core.quantities import metres
 from rille.stages.facts.terrain import AuditFacts, OverlapFacts
 
 Facts = Mapping[str, Any]
-
-MAX_NAMED = 3
-"""Models that a warning names."""
 
 
 class OverlapAuditParams(Params):
@@ -104,8 +102,6 @@ def overlap_audit_stage(params: OverlapAuditParams, seams: Sequence[Bundle[Overl
         "warnings": [],
     }
     if bad:
-        words = "; ".join(describe(m) for m in bad[:MAX_NAMED])
-        more = f"; and {len(bad) - MAX_NAMED} more" if len(bad) > MAX_NAMED else ""
-        count = f"{len(bad)} of {len(models)} elevation models"
-        facts["warnings"] = [f"{count} contradict their neighbours by more than their sigma allows: {words}{more}"]
+        words = f"{len(bad)} of {len(models)} elevation models contradict their neighbours by more than their sigma"
+        facts["warnings"] = [f"{words} allows: {told(bad, describe)}"]
     return Bundle({}, facts)

@@ -32,8 +32,6 @@ MIN_REFERENCE_SHARE = 0.4
 MIN_REACH_HEIGHTS = 5.0
 MAX_TURN_DEG = 10.0
 MAX_HEIGHT_CHANGE_SHARE = 0.25
-STATED_SHARE = 0.0
-"""Share of the matched pixels of ground that is stated (``ground_frame.reference_height``), not seen."""
 
 
 def seen_up(facts: GroundFacts) -> Floats | None:
@@ -99,7 +97,8 @@ class _Plane(NamedTuple):
         share, reach = facts["ground_share"], facts["ground_reach"]
         is_known = facts["source"] not in (GROUND_PLANE, NO_VERTICAL)
         is_level = is_known and level >= math.cos(math.radians(MAX_TILT_DEG))
-        is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == STATED_SHARE
+        # Ground that is stated (``ground_frame.reference_height``), not seen, has a share of 0.
+        is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == 0.0
         return _Plane(up, -facts["plane"][2] * level, is_ground, share, reach)
 
     def is_same(self, other: _Plane) -> bool:

@@ -33,8 +33,6 @@ from rille.stages.imaging.image_quality import glance
 
 Steps = Generator[Wait, Any, None]
 
-NAMED_IMAGES = 3
-"""Damaged images that are named one by one; the others are counted."""
 
 MOTIONS, COMPARED_PAIRS = 12, 6
 """Motions that are measured, and pairs whose rows are compared with those of shifted right images: all over the
@@ -147,7 +145,8 @@ class Inspection:
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
             if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
                 self.broken.add((frame, camera))
-        for refusal in errors[:NAMED_IMAGES]:
+        # The others are counted.
+        for refusal in errors[:3]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole

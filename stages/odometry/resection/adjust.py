@@ -158,10 +158,10 @@ def adjust_stage(
     stated = measured_alike(stated_factors(given, row), chain, calibration)
     sensors = Sensors.of(priors or {}, len(frames))
     own = OwnTrajectory(out.poses[posed], out.piece[posed], sensors.times[posed], posed)
-    sensors.believe(own, upright=NO_VERTICAL not in trajectory.meta["verticals"])
-    between = Factors.joined([stated, *sensors.between(own)])
+    sensors.drop_contradicting(own, upright=NO_VERTICAL not in trajectory.meta["verticals"])
+    between = Factors.joined([stated, *sensors.relative_factors(own)])
     sure = np.arange(len(between.ends)) >= len(given)
-    apart, own = own.poses, sensors.laid(join(own, between, sure))
+    apart, own = own.poses, sensors.joined_by_positions(join(own, between, sure))
     alone = own.piece[stated.ends[:, 0]] != own.piece[stated.ends[:, 1]]
     lines = [
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"

@@ -29,11 +29,11 @@ from rille.stages.odometry.resection.pnp import (
     Errors,
     Observations,
     Pose,
+    PoseCovariances,
     back_projection,
     bias_information,
     huber_costs,
     huber_weights,
-    pose_covariance,
 )
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
@@ -42,7 +42,7 @@ from rille.stages.odometry.resection.robust_pose import (
     correlation,
     frame_errors,
     scatter_of_blocks,
-    whole,
+    total_covariance,
 )
 
 
@@ -61,12 +61,12 @@ class SegmentTracks:
 
 
 class SegmentState(NamedTuple):
-    """``R`` (frame, 3, 3), ``t`` (frame, 3) of T_cam_local behind the key; ``depth`` (n,) corrections of the
+    """``R`` (frame, 3, 3), ``t`` (frame, 3) of T_cam_local behind the key; ``disparity`` (n,) corrections of the
     disparities, and the ``bias`` of all, pixels."""
 
     R: Floats
     t: Floats
-    depth: Floats
+    disparity: Floats
     bias: float = 0.0
 
 
@@ -110,9 +110,9 @@ class SegmentAdjustment:
 
     def errors(self, state: SegmentState, f: int) -> Errors:
         """Back-projection errors of frame ``f``; depths are unknowns, so landmarks have no error of their own."""
-        exact = replace(self.tracks.landmarks, sigma=np.zeros(len(state.depth)))
+        exact = replace(self.tracks.landmarks, sigma=np.zeros(len(state.disparity)))
         return back_projection(
-            self.observations(f)._replace(landmarks=exact), Pose(state.R[f], state.t[f], state.depth + state.bias)
+            self.observations(f)._replace(landmarks=exact), Pose(state.R[f], state.t[f], state.disparity + state.bias)
         )
 
     def weights(self, errors: Errors, f: int) -> Floats:
@@ -124,11 +124,11 @@ class SegmentAdjustment:
 
         Landmarks behind a camera do not count.
         """
-        p, n = 6 * len(state.R) + 1, len(state.depth)
+        p, n = 6 * len(state.R) + 1, len(state.disparity)
         held = self.tracks.landmarks.sigma**-2.0
-        out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.depth * held, 0.0)
+        out = SegmentNormal(np.zeros((p, p)), np.zeros((p, n)), held.copy(), np.zeros(p), state.disparity * held, 0.0)
         prior = bias_information(self.params.bias_sigma)
-        cost = 0.5 * float((state.depth**2 * held).sum() + prior * state.bias**2)
+        cost = 0.5 * float((state.disparity**2 * held).sum() + prior * state.bias**2)
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight, at = self.weights(errors, f), slice(6 * f, 6 * f + 6)
@@ -155,15 +155,15 @@ class SegmentAdjustment:
         matrix, right = normal._replace(poses=poses, depths=depths).without_depths()
         step = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
         R, t = perturbed(state.R, state.t, step[:-1].reshape(-1, 6))
-        depth = state.depth - (normal.depth_gradient + normal.between.T @ step) / depths
-        return SegmentState(R, t, depth, state.bias + float(step[-1]))
+        disparity = state.disparity - (normal.depth_gradient + normal.between.T @ step) / depths
+        return SegmentState(R, t, disparity, state.bias + float(step[-1]))
 
     def scatter(self, state: SegmentState) -> float:
         """Variance of the errors found over the one expected: weighted squares per degree of freedom.
 
         Depths add one unknown and one measurement each (their disparity), so that tracks and poses decide the freedom.
         """
-        total, measured = float(((state.depth / self.tracks.landmarks.sigma) ** 2).sum()), 0
+        total, measured = float(((state.disparity / self.tracks.landmarks.sigma) ** 2).sum()), 0
         for f in range(len(state.R)):
             errors = self.errors(state, f)
             weight = self.weights(errors, f)
@@ -224,7 +224,7 @@ class PosedTracks(NamedTuple):
 
     def landmarks(self) -> Floats:
         """Landmarks (n, 3) in this state, m, local frame."""
-        return self.tracks.landmarks.moved(self.state.depth + self.state.bias).position
+        return self.tracks.landmarks.moved(self.state.disparity + self.state.bias).position
 
 
 class PoseErrors(NamedTuple):
@@ -236,20 +236,19 @@ class PoseErrors(NamedTuple):
     excess: float
 
 
-def pose_errors(tracks: SegmentTracks, state: SegmentState, params: ResectParams) -> PoseErrors:
+def pose_errors(problem: SegmentAdjustment, state: SegmentState) -> PoseErrors:
     """Errors of the poses of an adjusted segment, of position (m) and rotation vector (rad) of T_local_left."""
-    problem, prior = SegmentAdjustment(tracks, params), bias_information(params.bias_sigma)
+    tracks, factor, count = problem.tracks, problem.scatter(state), len(state.R)
     matrix, _ = problem.normal(state).without_depths()
-    matrix[-1, -1] -= prior  # which stays as it is, however large the errors are
-    factor = problem.scatter(state)
-    measured, stated = pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
-    count = len(state.R)
-    own, shared, together = np.empty((count, 6, 6)), np.empty((count, 6, SHARED_SOURCES)), list[float]()
+    poses = PoseCovariances.of(matrix, problem.params.bias_sigma, factor)
+    own, shared, block_scatters = np.empty((count, 6, 6)), np.empty((count, 6, SHARED_SOURCES)), list[float]()
     for f in range(count):
         seen = tracks.seen[f]
         depth = float(np.median(tracks.landmarks.position[seen] @ state.R[f, 2] + state.t[f, 2]))
-        own[f], shared[f] = frame_errors(measured, stated, state.R[f], depth, f)
+        own[f], shared[f] = frame_errors(poses, state.R[f], depth, f)
         errors = back_projection(problem.observations(f), Pose(state.R[f], state.t[f], state.bias))
         weight = problem.weights(errors, f)[seen]
-        together.append(scatter_of_blocks(tracks.pixels[f][seen], errors.error[seen], weight, tracks.camera))
-    return PoseErrors(whole(own, shared, together), shared, max(factor, 1.0) * correlation(together))
+        block_scatters.append(scatter_of_blocks(tracks.pixels[f][seen], errors.error[seen], weight, tracks.camera))
+    return PoseErrors(
+        total_covariance(own, shared, block_scatters), shared, max(factor, 1.0) * correlation(block_scatters)
+    )

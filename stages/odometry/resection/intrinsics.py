@@ -42,7 +42,6 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 )
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.pnp import bias_information
-from rille.stages.odometry.resection.robust_pose import ResectParams
 
 PRIORS: Mapping[str, float] = {
     "focal length": 1.0,
@@ -61,8 +60,6 @@ the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calib
 CORRECTED = 3
 """How many of these are corrected: those of the camera without distortion."""
 
-YAW_PRIOR = 0.1
-"""Standard deviation of the rig's yaw, rad, over that of the focal length, as of the other angles."""
 
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
@@ -181,14 +178,11 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
     return math.degrees(rigid.angle(state.R @ T_local_key.rotation).max())
 
 
-def contribution(
-    tracks: SegmentTracks, state: SegmentState, cameras: SegmentCameras, params: ResectParams
-) -> IntrinsicsPart:
+def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: SegmentCameras) -> IntrinsicsPart:
     """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
-    problem = SegmentAdjustment(tracks, params)
-    normal, k = problem.normal(state), len(PRIORS)
+    tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
     *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
-    steps = [SegmentAdjustment(one, params) for one in changed]
+    steps = [replace(problem, tracks=one) for one in changed]
     p, n = normal.between.shape
     by_pose, by_depth, squares, gradient = np.zeros((p, k)), np.zeros((k, n)), np.zeros((k, k)), np.zeros(k)
     for f in range(len(state.R)):
@@ -218,7 +212,7 @@ def contribution(
     moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
     along = (moved * ray).sum(1) / (ray**2).sum(1)
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
-    own = max(of_bias - bias_information(params.bias_sigma), 0.0)
+    own = max(of_bias - bias_information(problem.params.bias_sigma), 0.0)
     yaw = own * px_per_rad**2, of_bias * state.bias * px_per_rad
     return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw)
 
@@ -332,7 +326,8 @@ def intrinsics_stage(
     )
     shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
     least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / focal
-    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([YAW_PRIOR * params.prior]), least)
+    # The yaw has the prior of the rig's other angles.
+    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([0.1 * params.prior]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:

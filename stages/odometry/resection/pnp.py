@@ -183,6 +183,21 @@ class PoseCovariance(NamedTuple):
     condition: float
 
 
+class PoseCovariances(NamedTuple):
+    """Errors of poses by the errors found, ``measured``, and by the larger of those and the stated ones, ``stated``."""
+
+    measured: PoseCovariance
+    stated: PoseCovariance
+
+    @staticmethod
+    def of(normal: Floats, bias_sigma: float, factor: float) -> PoseCovariances:
+        """By the normal matrix (p + 1, p + 1), the prior of the bias in it, and the variance of the errors found over
+        the stated one."""
+        prior, matrix = bias_information(bias_sigma), normal.copy()
+        matrix[-1, -1] -= prior  # which stays as it is, however large the errors are
+        return PoseCovariances(*(pose_covariance(matrix / by, prior) for by in (factor, max(factor, 1.0))))
+
+
 def pose_covariance(normal: Floats, prior: float) -> PoseCovariance:
     """Invert the normal matrix (p + 1, p + 1) of poses and bias, to which the prior of the bias is added.
 

@@ -27,7 +27,7 @@ from rille.stages.odometry.resection.sensors import (
     Sensor,
     VerticalPrior,
     anchor,
-    placed,
+    laid_on_fixes,
 )
 
 MAX_SIGMA_SHARE = 0.1
@@ -100,7 +100,7 @@ class Sensors:
             used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
         return Sensors(used, times, timed, given.get("georeference"))
 
-    def believe(self, own: OwnTrajectory, *, upright: bool) -> None:
+    def drop_contradicting(self, own: OwnTrajectory, *, upright: bool) -> None:
         """Leave out the sensors that contradict the camera's own chain, and say so; ``upright``: its z is known."""
         for name, sensor in list(self.used.items()):
             if reason := sensor.contradiction(own):
@@ -114,16 +114,16 @@ class Sensors:
         self.facts[name] = {"used": False, "why": reason}
         self.lines.append(f"[{name}] {how}is not used: {reason}: {remedy or REMEDY[name]}")
 
-    def between(self, own: OwnTrajectory) -> list[Factors]:
+    def relative_factors(self, own: OwnTrajectory) -> list[Factors]:
         """Factors of ways between frames, which may join pieces, clocks being right."""
         ways = (one for one in self.used.values() if isinstance(one, RelativePrior) and one.drift)
         return [sensor.factors(own, 0.0) for sensor in ways]
 
-    def laid(self, own: OwnTrajectory) -> OwnTrajectory:
+    def joined_by_positions(self, own: OwnTrajectory) -> OwnTrajectory:
         """The trajectory with those pieces joined that positions join."""
         if not isinstance(positions := self.used.get("positions"), PositionPrior):
             return own
-        found = placed(positions.fixes(own), own)
+        found = laid_on_fixes(positions.fixes(own), own)
         if found is None:
             self._refuse("positions", f"no piece has {MIN_FIXES} of them")
             return own

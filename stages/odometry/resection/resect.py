@@ -38,7 +38,7 @@ from rille.stages.odometry.resection.robust_pose import (
     Resection,
     ResectParams,
     resect,
-    whole,
+    total_covariance,
 )
 from rille.stages.odometry.resection.two_motions import CONTRADICTION, AmbiguousError, moving_by_themselves
 from rille.stages.odometry.resection.zoom import refuse_zoom
@@ -87,7 +87,7 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     out.inlier[known[:, 0], 0] = 1
     count = int(known[:, 0].sum())
     out.facts.append({"frame": frames[0], "landmarks": count, "inliers": count, "rms_px": 0.0})
-    last, together = key, list[float]()
+    last, block_scatters = key, list[float]()
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
 
@@ -128,8 +128,8 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
         out.inlier[use, j] = posed.inlier
         facts |= {"inliers": int(posed.inlier.sum()), "rms_px": posed.rms_px}
         facts |= {} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())}
-        together.append(posed.together)
-    out.covariance[:] = whole(out.covariance, out.shared, together)
+        block_scatters.append(posed.block_scatter)
+    out.covariance[:] = total_covariance(out.covariance, out.shared, block_scatters)
     return out
 
 
@@ -144,15 +144,14 @@ def adjust_segment(
     end = start and start.adjusted(adjust(start.tracks, start.state, params).state)
     if end is None:
         return {}
-    errors = pose_errors(end.tracks, end.state, params)
-    part = contribution(end.tracks, end.state, cameras, params)
+    problem = SegmentAdjustment(end.tracks, params)
+    errors, part = pose_errors(problem, end.state), contribution(problem, end.state, cameras)
     segment.covariance[end.frames], segment.shared[end.frames] = errors.covariance, errors.shared
     segment.by_intrinsics[end.frames] = part.by_error
     segment.landmarks[end.points] = end.landmarks()
     segment.inlier[:] = 0
     segment.inlier[end.points, 0] = end.tracks.seen.any(0)
     segment.inlier[np.ix_(end.points, end.frames)] = end.tracks.seen.T
-    problem = SegmentAdjustment(end.tracks, params)
     for f, row in enumerate(end.frames):
         segment.poses[row] = RigidTransform(end.state.R[f], end.state.t[f]).inverse().matrix34
         off = problem.errors(end.state, f).pixels[end.tracks.seen[f]]

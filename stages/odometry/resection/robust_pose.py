@@ -46,16 +46,12 @@ from rille.stages.odometry.resection.pnp import (
     Observations,
     Pose,
     PoseAdjustment,
-    PoseCovariance,
+    PoseCovariances,
     back_projection,
-    bias_information,
-    pose_covariance,
 )
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-MAX_STEPS = 50
-"""Steps of Levenberg-Marquardt, at most; about 10 suffice."""
 SEED = 1999 * 100_003
 """Seed of the random samples, to which the frame's number is added."""
 SHARED_SOURCES = 7
@@ -64,8 +60,6 @@ SEARCHED_PX = 9.0
 """Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
 THRESHOLD_SHARES = (0.25, 0.5, 1.0)
 """Shares of the threshold at which agreement is counted."""
-MAX_FALSE_ALARMS = 0.01
-"""Expected number of poses that chance alone makes in a frame whose tracks are all wrong: one in a hundred frames."""
 
 
 class ResectParams(Params):
@@ -105,7 +99,7 @@ class Resection:
     ``T_local_left``; ``covariance`` (6, 6) of (position m, rotation rad) in the local frame, without what is shared;
     ``shared`` (6, 7): pose errors per standard deviation of what all segments have in common; ``inlier`` (n,);
     ``residual`` (n,) back-projection error, pixels, of every landmark (NaN: behind the camera); ``bias`` of the
-    disparities, pixels; ``together``: how many times as far as independent errors the mean errors of image blocks
+    disparities, pixels; ``block_scatter``: how many times as far as independent errors the mean errors of image blocks
     scatter (variance), see :func:`scatter_of_blocks`.
     """
 
@@ -115,12 +109,12 @@ class Resection:
     inlier: Bools
     residual: Floats
     bias: float
-    together: float
+    block_scatter: float
 
     @property
     def total(self) -> Floats:
         """Covariance (6, 6) of the pose, all errors together, neighbours' being alike."""
-        return whole(self.covariance, self.shared, [self.together])
+        return total_covariance(self.covariance, self.shared, [self.block_scatter])
 
     @property
     def rms_px(self) -> float:
@@ -152,7 +146,7 @@ def resect(
     """
     where = f"frame {frame}"
     count = f"{where}: too few landmarks: {len(pixels)} have coordinates and were found ({landmarks.summary()})"
-    enough(len(pixels), count, "set track.points higher or choose basic pairs closer")
+    refuse_few(len(pixels), count, "set track.points higher or choose basic pairs closer")
     _not_collinear(landmarks.position, where)
     obs = Observations(landmarks, pixels, camera, params.pixel_sigma)
     predictions = [Pose.of(T.inverse()) for T in starts]
@@ -163,8 +157,7 @@ def resect(
     _not_collinear(landmarks.position[active], where)
     depth = float(np.median(obs.landmarks.position[active] @ pose.R[2] + pose.t[2]))
     normal = PoseAdjustment(obs, active, params.bias_sigma).normal(pose)
-    measured, stated = _certainty(errors, normal, depth, params, where)
-    covariance, shared = frame_errors(measured, stated, pose.R, depth)
+    covariance, shared = frame_errors(_certainty(errors, normal, depth, params, where), pose.R, depth)
     return Resection(
         RigidTransform(pose.R, pose.t).inverse(),
         covariance,
@@ -196,7 +189,8 @@ def _robust_start(obs: Observations, predictions: list[Pose], params: ResectPara
 
 def _adjusted(obs: Observations, active: Bools, start: Pose, params: ResectParams) -> Pose:
     """The pose of least cost for the active (n,) landmarks."""
-    return levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), start, MAX_STEPS).state
+    # About 10 steps suffice.
+    return levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), start, 50).state
 
 
 def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
@@ -216,7 +210,7 @@ def _without_inconsistent(
     bound = params.threshold / params.pixel_sigma
     while True:
         count = int(active.sum())
-        enough(
+        refuse_few(
             count,
             f"{where}: too few landmarks: {count} agree with one pose",
             "raise resect.threshold or choose basic pairs closer",
@@ -246,16 +240,13 @@ def _first_order(obs: Observations, pose: Pose) -> Bools:
     return np.asarray(spread <= MAX_RELATIVE_SIGMA * depth)
 
 
-def _certainty(
-    errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str
-) -> tuple[PoseCovariance, PoseCovariance]:
-    """Covariances of a pose by the errors found, and by the larger of those and the stated ones."""
-    active, prior, matrix = normal.weight > 0, bias_information(params.bias_sigma), normal.matrix.copy()
-    matrix[6, 6] -= prior  # which stays as it is, however large the errors are
+def _certainty(errors: Errors, normal: Normal, depth: float, params: ResectParams, where: str) -> PoseCovariances:
+    """Covariances of a pose; refuse one that is too uncertain by the stated errors."""
+    active = normal.weight > 0
     # A posteriori variance factor: the errors found, not the ones expected, set the scale.
     squares = (normal.weight[active] * errors.norm[active] ** 2).sum()
     factor = max(float(squares / (2 * active.sum() - 6)), 1e-12)
-    expected = pose_covariance(matrix, prior)
+    expected = PoseCovariances.of(normal.matrix, params.bias_sigma, 1.0).stated
     position_sigma = float(np.sqrt(np.trace(expected.noise[:3, :3]) + (expected.by_bias[:3] ** 2).sum()))
     if position_sigma > params.max_position_ratio * depth:
         raise DegenerateError(
@@ -264,27 +255,25 @@ def _certainty(
             f" by {position_sigma:.2g} m (condition {expected.condition:.1e})",
             remedy="they are too far, too few or in one direction: set track.points higher or use nearer texture",
         )
-    return pose_covariance(matrix / factor, prior), pose_covariance(matrix / max(factor, 1.0), prior)
+    return PoseCovariances.of(normal.matrix, params.bias_sigma, factor)
 
 
-def frame_errors(
-    measured: PoseCovariance, stated: PoseCovariance, R_cam_local: Floats, depth: float, at: int = 0
-) -> tuple[Floats, Floats]:
+def frame_errors(poses: PoseCovariances, R_cam_local: Floats, depth: float, at: int = 0) -> tuple[Floats, Floats]:
     """Covariance (6, 6) of one pose in the local frame by the errors found, and the root (6, 7) of what is shared.
 
     ``C = -R^T t`` and ``R^T`` change by ``-R^T v`` and ``-R^T w`` under a step (v, w); signs drop out of a covariance.
 
     Parameters
     ----------
-    measured, stated : scaled by the errors found, and by the larger of those and the expected ones; the difference is
-        what segments share, and ``stated`` has the part of the bias.
+    poses : those that were adjusted together; what the stated errors add to the measured ones is what segments share,
+        with the part of the bias.
     depth : median distance of the landmarks, m.
-    at : place of the pose among those that were adjusted together.
+    at : place of the pose among them.
     """
     turn, rows = np.kron(np.eye(2), R_cam_local.T), slice(6 * at, 6 * at + 6)
-    covariance = turn @ measured.noise[rows, rows] @ turn.T
-    shared = root(turn @ stated.noise[rows, rows] @ turn.T - covariance, depth)
-    return covariance, np.column_stack([shared, turn @ stated.by_bias[rows]])
+    covariance = turn @ poses.measured.noise[rows, rows] @ turn.T
+    shared = root(turn @ poses.stated.noise[rows, rows] @ turn.T - covariance, depth)
+    return covariance, np.column_stack([shared, turn @ poses.stated.by_bias[rows]])
 
 
 def root(covariance: Floats, depth: float) -> Floats:
@@ -319,20 +308,20 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
     return float((sums[:, used] ** 2 / count[used]).sum()) / spread / freedom
 
 
-def correlation(together: Sequence[float]) -> float:
+def correlation(block_scatters: Sequence[float]) -> float:
     """Variance of poses over that by independent errors: the mean of what :func:`scatter_of_blocks` gives, at least 1.
 
     Of one frame it scatters by a fifth; frames of a segment share their landmarks.
     """
-    return max(1.0, float(np.mean(together))) if together else 1.0
+    return max(1.0, float(np.mean(block_scatters))) if block_scatters else 1.0
 
 
-def whole(covariance: Floats, shared: Floats, together: Sequence[float]) -> Floats:
+def total_covariance(covariance: Floats, shared: Floats, block_scatters: Sequence[float]) -> Floats:
     """Covariances (..., 6, 6) with all errors: neighbours' being alike, and those that segments share (..., 6, 7)."""
-    return np.asarray(correlation(together) * covariance + shared @ np.swapaxes(shared, -1, -2))
+    return np.asarray(correlation(block_scatters) * covariance + shared @ np.swapaxes(shared, -1, -2))
 
 
-def enough(count: int, what: str, remedy: str) -> None:
+def refuse_few(count: int, what: str, remedy: str) -> None:
     """Refuse a pose of fewer than :data:`MIN_LANDMARKS` landmarks; ``what`` says of which frame, and how many."""
     if count < MIN_LANDMARKS:
         raise DegenerateError("RIL-421", f"{what}, {MIN_LANDMARKS} are needed", remedy=remedy)
@@ -360,7 +349,8 @@ def _not_by_chance(errors: Errors, params: ResectParams, where: str) -> None:
         if count >= MIN_LANDMARKS:
             chance = float(scipy.special.bdtrc(count - 4, n - 3, share))
             alarms = min(alarms, len(THRESHOLD_SHARES) * math.comb(n, 3) * chance)
-    if alarms > MAX_FALSE_ALARMS:
+    # Of frames whose tracks are all wrong, one in a hundred may pass.
+    if alarms > 0.01:
         raise DegenerateError(
             "RIL-720",
             f"{where}: {count} of {n} landmarks agree with one pose, which as many may do by chance",

@@ -136,7 +136,7 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 
 
-def at_best(departs: Callable[[float], tuple[float, str]], *, clocked: bool) -> str:
+def best_departure(departs: Callable[[float], tuple[float, str]], *, clocked: bool) -> str:
     """How a sensor departs from the camera at all clocks, by the one at which it does least; empty: at one it does not.
 
     ``departs``: by which share it departs with a clock that is so late, s, and how, see :func:`departure`; infinite
@@ -173,7 +173,7 @@ class RelativePrior:
 
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own trajectory contradicts it at all clocks; empty: it does not."""
-        return at_best(lambda shift: self._departure(own, shift), clocked=self.times is not None)
+        return best_departure(lambda shift: self._departure(own, shift), clocked=self.times is not None)
 
     def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
@@ -286,13 +286,13 @@ class PositionPrior:
     def contradiction(self, own: OwnTrajectory) -> str:
         """Why the camera's own way in the plane contradicts the shape of the positions at all clocks; empty: it does
         not."""
-        return at_best(lambda late: self._departure(own, late), clocked=self.clocked)
+        return best_departure(lambda late: self._departure(own, late), clocked=self.clocked)
 
     def _departure(self, own: OwnTrajectory, late: float) -> tuple[float, str]:
         """By which share of the camera's ways in the worst piece positions depart that are so late, s; why that is too
         much."""
         fixes, found = self.fixes(own, late), list[tuple[float, str]]()
-        for k in enough(fixes, own.piece):
+        for k in pieces_with_fixes(fixes, own.piece):
             mine = own.piece[fixes.nodes] == k
             way = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
             said = fit_plane(fixes.positions[mine], way).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
@@ -362,12 +362,12 @@ def fit_plane(positions: Floats, antenna: Floats) -> RigidTransform:
     return RigidTransform(R, antenna.mean(0) - R @ positions.mean(0))
 
 
-def placed(fixes: Fixes, own: OwnTrajectory) -> tuple[RigidTransform, OwnTrajectory] | None:
+def laid_on_fixes(fixes: Fixes, own: OwnTrajectory) -> tuple[RigidTransform, OwnTrajectory] | None:
     """How positions are laid on the first piece that has enough of them, and the other such pieces on these positions.
 
     None where no piece has enough.
     """
-    first, *others = enough(fixes, own.piece) or (-1,)
+    first, *others = pieces_with_fixes(fixes, own.piece) or (-1,)
     if first < 0:
         return None
     mine, poses, piece = own.piece[fixes.nodes], own.poses, own.piece
@@ -378,7 +378,7 @@ def placed(fixes: Fixes, own: OwnTrajectory) -> tuple[RigidTransform, OwnTraject
     return laid, own._replace(poses=poses, piece=piece)
 
 
-def enough(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
+def pieces_with_fixes(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
     """Numbers of the pieces that have positions beside enough nodes to be laid on them."""
     beside = np.bincount(piece[np.unique(fixes.nodes)])
     return [int(k) for k, count in enumerate(beside) if count >= MIN_FIXES]

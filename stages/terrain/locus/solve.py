@@ -5,35 +5,20 @@ The kernel and its equations are in :mod:`rille.stages.terrain.locus.kernel`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import Params
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.scale import axes
 from rille.stages.terrain.locus.kernel import Cells, Dem, Observed, PairCameras, search
+from rille.stages.terrain.matches import Matches
 
 COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
 MAX_JUMP_PX = 3.0  # range of the four disparities around a cell that are one surface; beyond, ground is hidden there
 ONE_SIDED_STD_FACTOR = 2.0  # matched one way alone: errors of such cells are two to three times as large
-
-
-@dataclass(frozen=True)
-class Matches:
-    """Disparity vectors (rows, cols) of one image, the other one minus it, pixels; which of them may be used.
-
-    ``std``: standard deviation of the usable ones, pixels; None: not known.
-    """
-
-    column: ArrayLike
-    row: ArrayLike
-    usable: Bools
-    std: ArrayLike | None = None
 
 
 class LocusParams(Params):

@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, Memory, raster, stage
 from rille.stages.core.errors import ConfigError, DegenerateError
-from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MovingFacts, TrajectoryFacts
@@ -40,9 +39,10 @@ from rille.stages.terrain.ground_frame import z_range as plane_z_range
 from rille.stages.terrain.locus.coverage import coverage, explain
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import LocusParams, Matches, cameras_of, join, observed, solve
+from rille.stages.terrain.locus.solve import LocusParams, cameras_of, join, observed, solve
 from rille.stages.terrain.locus.uncertainty import NEAR_SIDE_CELLS, standard_deviation
 from rille.stages.terrain.locus.views import SurfaceViews, View, facing
+from rille.stages.terrain.matches import Matches
 
 OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
@@ -192,12 +192,6 @@ def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTra
     return Lattice.snap(bounds, lattice.cell), [float(low[2] - margin), float(high[2] + margin)]
 
 
-def _matches(disparity: Bundle) -> Matches:
-    good = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
-    maps = np.asarray(disparity["column_disparity"]), np.asarray(disparity["row_disparity"])
-    return Matches(*maps, good, disparity.arrays.get("disparity_std"))
-
-
 def _lead_to(back: Matches, marked: Bools) -> Bools:
     """Which matched pixels of the right image (row, col) lead to marked ones of the left image (row, col)."""
     row, col = np.nonzero(back.usable)
@@ -261,8 +255,8 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
     """Elevation model and ortho image of a basic pair."""
     rig, level, trajectory = Rig.from_dict(inputs.rig.meta["rig"]), inputs.level.meta, inputs.trajectory
     T_local_left = RigidTransform.from_matrix(level["T_local_left"])
-    matches = _matches(inputs.disparity)
-    back = _matches(inputs.back) if inputs.back is not None else None
+    matches = Matches.of(inputs.disparity)
+    back = Matches.of(inputs.back) if inputs.back is not None else None
     if inputs.moving is not None:
         moving = np.asarray(inputs.moving["moving"]) != 0
         matches.usable[moving] = False
@@ -283,9 +277,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
             raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
         cell = params.cell_size or reference["cell_size"]
         params = _limited(params, reference, cell)
-        maps = np.asarray(matches.column), np.asarray(matches.row)
-        samples = sampled(maps, matches.usable, rig, params.sigma_disparity)
-        seen = view_matches(samples, rig, T_local_left, params.sigma_disparity)
+        seen = view_matches(sampled(matches, rig, params.sigma_disparity), T_local_left)
         view = seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level)
         T, lattice = T_local_left, local_lattice(view, cell, params)
         z_range = plane_z_range(level["plane"], level["relief"], list(lattice.bounds))

@@ -13,9 +13,6 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.shading import gradient
 
-MIN_KNOWN_OF_FOUR = 2
-"""Of four cells that become one."""
-
 
 @dataclass(frozen=True)
 class Grid:
@@ -90,7 +87,7 @@ class Grid:
         rows, cols = (n // 2 for n in self.values.shape)
         four = self.values[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2)
         count = np.isfinite(four).sum(axis=(1, 3))
-        mean = np.where(count >= MIN_KNOWN_OF_FOUR, np.nansum(four, axis=(1, 3)) / np.maximum(count, 1), np.nan)
+        mean = np.where(count >= 2, np.nansum(four, axis=(1, 3)) / np.maximum(count, 1), np.nan)
         return Grid(mean, self.matrix @ np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]))
 
     def part(self, window: tuple[slice, slice]) -> Grid:

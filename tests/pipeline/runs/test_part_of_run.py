@@ -70,7 +70,12 @@ def test_the_files_of_a_stage_are_those_that_read_nothing_else(chain: Chain) -> 
 
 @pytest.mark.parametrize(
     ("until", "only", "code", "remedy"),
-    [(("hvfm",), (), "RIL-035", "hfvm"), ((), ("dem.tiff",), "RIL-035", "dem.tif"), (("rig",), ("a",), "RIL-034", "")],
+    [
+        (("hvfm",), (), "RIL-035", "hfvm"),
+        ((), ("dem.tiff",), "RIL-035", "dem.tif"),
+        (("rig",), ("a",), "RIL-034", ""),
+        ((), ("report.json",), "RIL-036", "leave --only out"),
+    ],
 )
 def test_what_there_is_not_is_refused(
     chain: Chain, until: tuple[str, ...], only: tuple[str, ...], code: str, remedy: str

@@ -83,7 +83,7 @@ def error_of(state, T):
 def moved(state, step, depth=0.0, bias=0.0):
     """The state after steps of poses (frame, 6), depths and bias."""
     R, t = perturbed(state.R, state.t, step)
-    return SegmentState(R, t, state.depth + depth, state.bias + bias)
+    return SegmentState(R, t, state.disparity + depth, state.bias + bias)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -97,7 +97,7 @@ def test_a_scene_of_one_depth_keeps_its_scale(seed):
 
 def test_gradient_is_that_of_the_cost():
     views, state, _ = scene(1, n=20)
-    problem, state = SegmentAdjustment(views, PARAMS), state._replace(depth=np.linspace(-0.3, 0.3, 20))
+    problem, state = SegmentAdjustment(views, PARAMS), state._replace(disparity=np.linspace(-0.3, 0.3, 20))
     normal, none = problem.normal(state), np.zeros((3, 6))
 
     def slope(step, **more):
@@ -165,9 +165,9 @@ def test_the_covariance_is_the_inverse_of_the_whole_normal_matrix():
     def residuals(x):
         """Whitened errors of tracks, of depths and of the bias."""
         at = moved(state, x[:12].reshape(m, 6), x[12 : 12 + n], x[-1])
-        X = views.landmarks.position + (at.depth + at.bias)[:, None] * views.landmarks.per_pixel
+        X = views.landmarks.position + (at.disparity + at.bias)[:, None] * views.landmarks.per_pixel
         tracks = [(CAMERA.project(X @ R.T + t) - p) / 0.2 for R, t, p in zip(at.R, at.t, views.pixels, strict=True)]
-        return np.concatenate([*(t.ravel() for t in tracks), at.depth / views.landmarks.sigma, [at.bias / 0.1]])
+        return np.concatenate([*(t.ravel() for t in tracks), at.disparity / views.landmarks.sigma, [at.bias / 0.1]])
 
     steps = 1e-6 * np.eye(12 + n + 1)
     J = np.array([(residuals(e) - residuals(-e)) / 2e-6 for e in steps]).T
@@ -188,7 +188,7 @@ def test_claimed_covariances_are_those_of_the_errors():
         rng = np.random.default_rng([seed, 1])
         views, start, T = scene(200 + seed, n=120, bias=0.1 * rng.standard_normal())
         state = adjust(views, start, PARAMS).state
-        covariance = pose_errors(views, state, PARAMS).covariance
+        covariance = pose_errors(SegmentAdjustment(views, PARAMS), state).covariance
         for R, t, true, claimed in zip(state.R, state.t, T, covariance, strict=True):
             found, right = RigidTransform(R, t).inverse(), true.inverse()
             turn = right.rotation @ found.rotation.T

@@ -10,7 +10,13 @@ import pytest
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
-from rille.stages.odometry.resection.bundle_adjustment import SegmentState, SegmentTracks, adjust, pose_errors
+from rille.stages.odometry.resection.bundle_adjustment import (
+    SegmentAdjustment,
+    SegmentState,
+    SegmentTracks,
+    adjust,
+    pose_errors,
+)
 from rille.stages.odometry.resection.intrinsics import (
     CORRECTED,
     PRIORS,
@@ -75,7 +81,7 @@ def facts_of(
     for seed in range(8):
         tracks, state, cameras = segment(seed, given, lens, turn, yaw, base)
         end = adjust(tracks, state, PARAMS).state
-        part = contribution(tracks, end, cameras, PARAMS)
+        part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
         facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": part.yaw}
         parts.append(Bundle({}, {"intrinsics": facts}))
     rig = Bundle({}, {"rig": cameras.rig.to_dict()})
@@ -160,7 +166,8 @@ def test_covariances_contain_the_errors_of_the_calibration():
             given = corrected(CAMERA, sigma * rng.standard_normal(CORRECTED))
             tracks, true, cameras = segment(100 + seed, given, Lens(CAMERA), turn)
             state = adjust(tracks, true, PARAMS).state
-            part, own = contribution(tracks, state, cameras, PARAMS), pose_errors(tracks, state, PARAMS)
+            problem = SegmentAdjustment(tracks, PARAMS)
+            part, own = contribution(problem, state, cameras), pose_errors(problem, state)
             for f in range(2):
                 T, Q = (RigidTransform(s.R[f], s.t[f]).inverse() for s in (state, true))
                 turned = Q.rotation @ T.rotation.T
@@ -175,7 +182,8 @@ def test_covariances_contain_the_errors_of_the_calibration():
 
 def test_a_turned_right_camera_moves_poses_as_the_change_with_its_angles_says():
     tracks, true, cameras = segment(5, CAMERA, Lens(CAMERA), 0.05)
-    part, number = contribution(tracks, adjust(tracks, true, PARAMS).state, cameras, PARAMS), NAMES.index("roll")
+    problem, number = SegmentAdjustment(tracks, PARAMS), NAMES.index("roll")
+    part = contribution(problem, adjust(tracks, true, PARAMS).state, cameras)
     by = 2e-4
     other = with_errors(tracks, cameras, by * np.eye(len(NAMES) + 1)[number])
     before, after = adjust(tracks, true, PARAMS).state, adjust(other, true, PARAMS).state

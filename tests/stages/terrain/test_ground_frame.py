@@ -14,10 +14,12 @@ from rille.stages.core.validity import Validity
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
+from rille.stages.terrain import ground_frame
 from rille.stages.terrain import ground_frame as level_stage
 from rille.stages.terrain.ground import view_ground
-from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, level, z_range
+from rille.stages.terrain.ground_frame import SCENE, GroundFrameParams, VerticalHint, z_range
 from rille.stages.terrain.locus.stage import LocusParams, local_lattice
+from rille.stages.terrain.matches import Matches
 
 RIG = toed_in_rig()
 PARAMS = GroundFrameParams()
@@ -25,6 +27,11 @@ PARAMS = GroundFrameParams()
 PITCH, ROLL, HEIGHT = 18.0, 2.0, 0.18
 POSE = pitched(PITCH, ROLL)
 FLAT = disparity(RIG, POSE, plane(0.0, 0.0, -HEIGHT))
+
+
+def level(column, row, usable, *given, **more) -> dict:
+    """Facts of the stage by a pair's disparities."""
+    return ground_frame.level(Matches(column, row, usable), *given, **more)
 
 
 def tilt_of(facts: dict) -> float:

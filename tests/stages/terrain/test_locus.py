@@ -28,8 +28,8 @@ from rille.stages.terrain.ground import view_ground
 from rille.stages.terrain.locus import kernel, stage
 from rille.stages.terrain.locus import solve as locus_solve
 from rille.stages.terrain.locus.kernel import Dem
-from rille.stages.terrain.locus.solve import Matches
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
+from rille.stages.terrain.matches import Matches
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(30.0, roll_deg=3.0)

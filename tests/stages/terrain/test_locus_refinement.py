@@ -8,10 +8,11 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.spline import coefficients
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import ONE_SIDED_STD_FACTOR, Matches, join
+from rille.stages.terrain.locus.solve import ONE_SIDED_STD_FACTOR, join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 from rille.stages.terrain.locus.uncertainty import HOLE_VARIANCE_PX2, standard_deviation
 from rille.stages.terrain.locus.views import SurfaceViews, View, look
+from rille.stages.terrain.matches import Matches
 
 RIG = toed_in_rig()
 T_LOCAL_LEFT = pitched(35.0, roll_deg=3.0)
