@@ -52,7 +52,6 @@ BRIDGE = 0.1
 GAP = 2.5
 """The same of a slow sensor, in median spacings: one missing sample (2) is common, more is not."""
 
-
 GYROSCOPE = re.compile(r"(.*[./])?(gyr|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
 """How names of columns begin, behind the path of a field of a message of ROS."""

@@ -46,7 +46,6 @@ EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).bytesw
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
 """How files begin."""
 
-
 ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
 """What nothing else ends a file with, by its first two bytes."""
 

@@ -34,7 +34,6 @@ TRUTH_SOURCE = "the simulator's own poses: exact"
 EVALUATION_WINDOW_M = (-0.3, 0.4, 0.3, 0.7)
 """m, evaluation window of a basic pair: 600 x 300 mm about where the optical axes cross (0.55 m ahead)."""
 
-
 LOOP: Mapping[str, Any] = {
     "image_width": 320,
     "image_height": 240,

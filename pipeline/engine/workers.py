@@ -50,7 +50,6 @@ KINDS = ("dask", "inline")
 WATCH_SECONDS = 0.2
 """Time until something else than an end of a task is looked after."""
 
-
 CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
 """Time within which a scheduler must have answered, at first and later."""
 

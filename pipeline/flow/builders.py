@@ -49,7 +49,6 @@ Args = Mapping[str, Any]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-
 NO_PARAMS = NoParams()
 """One object for all tasks without parameters."""
 

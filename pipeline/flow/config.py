@@ -48,7 +48,6 @@ ACCURATE_FOLLOWS = (Follows("hfvm", "preset", "accurate", {"locus": {"refined_sh
 With an accurate matcher the mean of what the disparity says and of what the images show is better than either.
 """
 
-
 NAVIGATION: dict[str, Any] = {
     "hfvm": {"preset": "fast"},
     "motion": {"level": 3},

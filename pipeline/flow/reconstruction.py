@@ -99,13 +99,11 @@ from rille.stages.terrain.tile_index import tile_index_stage
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
-
 SEAMS = 24
 """Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
 
 SUSPECTS = 12
 """Pairs of doubtful rows that are compared with right images of other times at once."""
-
 
 PLACES_FRAMES = 500
 """Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""

@@ -17,7 +17,6 @@ from rille.stages.imaging import levels
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
 
-
 WHY_NOT = (
     (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
     (Validity.OUT_OF_IMAGE, "have their match outside the right image"),

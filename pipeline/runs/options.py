@@ -19,7 +19,6 @@ COMPLETE, FAILED, USAGE, HOLES, INTERRUPTED = 0, 1, 2, 3, 130
 
 RUNS = Path("runs")
 
-
 FLAG = Parameter(negative="")
 """An option that is given or not, without a ``--no-`` form."""
 

@@ -45,7 +45,6 @@ from rille.stages.geometry.geometry import Rig
 
 ANGLES = 3
 
-
 BEYOND = 1.0
 BEYOND_SHARE = 0.1
 """Share of matches more than ``BEYOND`` pixels beyond infinity from which on depth is wrong; a sky has fewer."""
@@ -53,14 +52,12 @@ BEYOND_SHARE = 0.1
 BEYOND_LEFT = 0.03
 """Largest share of matches beyond infinity that may remain after a correction that explains the others."""
 
-
 PRIOR_ROTATION_DEG, PRIOR_BASELINE_DEG = 0.05, 0.2
 """Standard deviations [degrees] of each rotation angle, and of the baseline's direction, of an intact calibration."""
 
 SYSTEMATIC_PX = 0.1
 """Smooth row error [pixels RMS over the image] that no rig explains and more matches do not reduce: remains of lens
 model and rectification."""
-
 
 MAX_DEPTH_ERROR = 0.03
 """Largest relative depth error that the uncertainty of an observed parameter may cause; a wrong toe-in of a parallel

@@ -38,10 +38,8 @@ SIZE = RIG + PRINCIPAL + len(TERMS)
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""
 
-
 EXACT_RAD = 1e-7
 """Standard deviation [rad] of a parameter that is held exactly."""
-
 
 MIN_MATCHES = 50
 

@@ -33,7 +33,6 @@ SPAN = 2
 OVERLAP = 3
 """Frames common to successive windows; they join the windows."""
 
-
 SEED = 0
 """Of COLMAP's random sampling."""
 
@@ -41,7 +40,6 @@ ADJUSTED_GROWTH, ADJUSTED_IMAGES, ADJUSTED_CHANGE, NEW_CHANGE = 3.0, 2, 1e-4, 1e
 """Factor in frames or points by which a model grows before all of it is adjusted again; images that are adjusted with a
 new one; and relative change of the cost below which an adjustment of all, or of these, ends. COLMAP's 1.1, 6, 0 and 0
 take twice the time, and change no error by a tenth."""
-
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""

@@ -25,7 +25,6 @@ SHIFT_CELLS = 0.25
 SURE, BESIDE, SURE_VOLUME = 4.5, 2.0, 3.5
 """Standard deviations that one cell of a change differs by, all of its cells, and its volume."""
 
-
 FOOT = 2
 """Cells about a patch in which a change runs out, below what single cells tell."""
 

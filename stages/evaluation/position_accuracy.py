@@ -47,7 +47,6 @@ MIN_SHARE = 2 / 3
 EQUAL_ERROR = 2**0.5
 """Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
 
-
 MAX_RANGE_SHARE = 0.5
 """Share of the searched range: where equally good offsets span more, the offset is not determined."""
 

@@ -44,7 +44,6 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
 MIN_FOCAL_SHARE = 0.7
 """A fisheye's ideal camera keeps at least this share of its focal length, so half of the pixels at the centre."""
 
-
 CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
 

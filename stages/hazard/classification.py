@@ -57,7 +57,6 @@ LIFT_START_EXCESS = -0.4
 LIFT_WIDTH_EXCESS = 0.6
 """Excess over which the rise of t grows to the whole of it."""
 
-
 NO_BITS = np.uint16(0)
 
 

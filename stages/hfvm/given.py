@@ -115,7 +115,6 @@ MIN_MATCHES = 100
 MAX_FIT_MATCHES = 2000
 """Matches that the lines are fitted to."""
 
-
 PATCH_RADIUS_PX = 8
 """Pixels: half side of a patch."""
 

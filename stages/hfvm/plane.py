@@ -54,7 +54,6 @@ MIN_EXPLAINED_SHARE = 0.6
 MIN_EXPLAINED_OF_FEW = 0.5
 """The same where windows are so sheared that few match, and of these the ground the least."""
 
-
 MIN_DISTORTION = 0.2
 """Shear or stretch, pixels per pixel, from which on images are aligned."""
 
@@ -282,7 +281,6 @@ MAX_SIDE_PX = 1024
 
 MIN_CONTRAST = 0.02
 """Least contrast of a keypoint; half of OpenCV's default, for sand and haze."""
-
 
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""

@@ -71,7 +71,6 @@ WINDOW_RADIUS_PX = 2
 ASSUMED_NOISE_VARIANCE = 8.0
 """Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
 
-
 MAX_CORRECTION_PX = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
@@ -335,7 +334,6 @@ BEND_STIFFNESS = 2000.0
 
 MAX_BEND_PX = 0.05
 """Second difference, pixels, beyond which the stiffness gives way to an edge."""
-
 
 RELIEF_STEPS = 4
 """Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""

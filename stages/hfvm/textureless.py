@@ -207,7 +207,6 @@ MAX_DEVIATION_GREY = 1.0
 MIN_REGION_PX = 6 * WINDOW_SIDE_PX * WINDOW_SIDE_PX
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
-
 MAX_VOTE_DISTANCE_PX = 1.25
 """Pixels of the level: the plane is that with the most votes nearer than this; with twice of it tilted planes were
 chosen. No whole number, as displacements are."""

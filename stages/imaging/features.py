@@ -26,7 +26,6 @@ UNIT_BYTES = 512.0
 MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
 """COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
 
-
 MAX_FEATURES, MAX_IMAGE_SIDE = 1300, 1400
 """Features of an image, of most contrast; and pixels of its longer side, above which it is reduced before."""
 

@@ -22,7 +22,6 @@ from rille.stages.core.declare import AnyArray
 BLOCK_SIDE_PX = 16
 """Pixels of level 0; level 1 shows the same block by half as many."""
 
-
 SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32) / np.sqrt(np.float32(6))
 """Leaves white noise its variance."""
 

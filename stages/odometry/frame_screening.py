@@ -38,7 +38,6 @@ SIDES = ("left", "right")
 GREYS = ((MAX_DARK_GREY, "black"), (MIN_BRIGHT_GREY, "uniform"), (np.inf, "white"))
 """Largest mean grey value of a uniform image, and how it is called."""
 
-
 SIMULTANEOUS_SHARE = 0.6
 """Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
 a frame are not of one time. A best share below it is that of a wrong rig, and tells nothing of the times."""

@@ -39,7 +39,6 @@ BORDER = 8
 REACH_PX = 4.0
 """Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
 
-
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
 

@@ -28,7 +28,6 @@ from rille.stages.geometry.geometry import Rig
 MIN_DEPTH_SIGMAS = 3.0
 """An inverse depth that is not this many of its standard deviations above 0 may as well be infinitely far."""
 
-
 MAX_CUBES = 1_000_000
 """Cubes to either side of the origin."""
 

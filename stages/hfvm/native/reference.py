@@ -28,7 +28,6 @@ TRUNCATION = 2
 COLUMNS = 8
 """Columns that are searched together."""
 
-
 SUM_RADIUS = 2
 """Pixels: reach of the windows over which distances are summed."""
 

@@ -60,7 +60,6 @@ the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calib
 CORRECTED = 3
 """How many of these are corrected: those of the camera without distortion."""
 
-
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
 
