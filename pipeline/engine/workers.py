@@ -341,6 +341,7 @@ class Dask:
         while not ended:
             # Not for ever: a call whose worker died and a scheduler that is lost send no event.
             ended = self._events_of(WATCH_SECONDS)
+            # The scheduler is looked at every two seconds.
             due = time.monotonic() - self._looked > 2.0
             if due:
                 self._look()

@@ -318,6 +318,7 @@ def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np
     """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
+    # Comparing all keypoints with all takes their number squared.
     sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
     points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
     if not points:
