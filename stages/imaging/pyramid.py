@@ -176,8 +176,7 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
     """
     dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
-    # A frame touches a tenth of a side at least, and reaches in by a tenth of the shorter side at most.
-    # A tenth of a side that it touches, and eight pixels.
+    # A frame touches a tenth of a side, eight pixels at least, and reaches in by a tenth of the shorter side at most.
     least = [max(0.1 * dark[side].size, 8) for side in sides]
     if all(np.count_nonzero(dark[side]) < n for side, n in zip(sides, least, strict=True)):
         return None
