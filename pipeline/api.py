@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
+from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -92,8 +93,8 @@ def reconstruct(
         assignments=tuple(assignments(settings)),
         frames=frames,
         executor=executor if client is None else client,
-        runs=Path(runs),
-        cache=None if cache is None else str(cache),
+        runs=Path(runs).expanduser(),  # no shell has seen a ~ of a notebook
+        cache=None if cache is None else expanduser(cache),
         quiet=quiet,
     )
     try:
@@ -160,7 +161,7 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
     """
     from rille.pipeline.runs import lookup
 
-    return Run(lookup.find(str(path), Path(runs)))
+    return Run(lookup.find(expanduser(path), Path(runs).expanduser()))
 
 
 @dataclass(frozen=True)

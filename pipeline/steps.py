@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field, replace
 from operator import index, methodcaller
+from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -187,7 +188,7 @@ def place_of(path: object) -> str:
     if not isinstance(path, str | Path):
         text = f"a {type(path).__name__} is no sequence"
         raise InputError("RIL-970", text, remedy="give a name, a path, or what rille.open returns")
-    return str(path)
+    return expanduser(path)
 
 
 def check_sections(settings: Mapping[str, object]) -> None:

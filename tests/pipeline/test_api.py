@@ -22,6 +22,8 @@ import rille
 from rille.pipeline import api, steps
 from rille.pipeline.engine import code_digest, events
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs.options import Options
+from rille.stages.core.errors import ConfigError
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 STAGES = {"keyframes": {"stride": 2}, "locus": {"cell_size": 0.004}, "hfvm": {"preset": "fast"}}
@@ -231,3 +233,14 @@ def test_a_failure_of_the_system_is_an_error_of_rille(tmp_path: Path, monkeypatc
     monkeypatch.setattr("rille.pipeline.engine.runtime.atomic.write", full)
     given = {"runs": tmp_path / "runs", "cache": tmp_path / "cache", "executor": "inline"}
     assert [error.code for error in rille.reconstruct_many(["mockup-short"] * 2, **given)] == ["RIL-737"] * 2
+
+
+def test_a_tilde_is_the_home_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(given: str, options: Options) -> None:
+        assert (given, options.runs, options.cache) == (f"{tmp_path}/a", tmp_path / "b", f"{tmp_path}/c")
+        raise ConfigError("RIL-061", "far enough")
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr("rille.pipeline.runs.session.perform", stop)
+    with raises("RIL-061"):
+        rille.reconstruct("~/a", runs="~/b", cache="~/c")
