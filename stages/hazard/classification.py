@@ -6,8 +6,10 @@ For a measure V with limit L, bias b and spread d per metre of the elevations' s
     excess = (V - b s - L) / (d s')              s' = s above the limit, else s widened by what unknown ground may hide
 
 A cell's class follows from its greatest load, ``p_hazard = F(greatest excess)`` from its greatest excess: all measures
-look at one ground, so they err together. F is Student's t, since matching errs grossly now and then, steeper about the
-limit (:data:`LIFT`). With ``k d >= b``, which is enforced, more noise is never safer.
+look at one ground, so they err together. ``p_wheel`` is F of the greatest excess of the measures of the wheel's window:
+whether a wheel meets an edge does not depend on how the vehicle would stand there. F is Student's t, since matching
+errs grossly now and then, steeper about the limit (:data:`LIFT`). With ``k d >= b``, which is enforced, more noise is
+never safer.
 
 The measures on blocks are judged on blocks. A cell starts with the load and the excess of its block; then each measure
 on cells is compared with its limit.
@@ -131,13 +133,19 @@ def classify(
         return np.asarray(a.repeat(n, axis=0)[:rows].repeat(n, axis=1)[:, :cols])
 
     nothing = Verdicts(np.zeros_like(share), np.full_like(share, -MAX_EXCESS), np.zeros(share.shape, np.uint16))
-    on_cells, on_blocks = ([m for m in measures if m.on_blocks == kind] for kind in (False, True))
-    judged = _judged(nothing, terrain, params.sigmas, [(m, values[m.name]) for m in on_blocks], (noise, doubt))
     wide = np.stack([spread(a) for a in noise]), np.stack([spread(a) for a in doubt])
-    fine, cells = [(m, values[m.name]) for m in on_cells], Verdicts(*(spread(a) for a in judged))
-    load, excess, over = _judged(cells, terrain, params.sigmas, fine, wide)
-    steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
-    p = _table()[steps.astype(np.intp)]
+
+    def judged(*, below: bool) -> Verdicts:
+        """Verdicts (row, col) by the measures of a wheel's window, or of all ground below the vehicle."""
+        on_cells, on_blocks = (
+            [(m, values[m.name]) for m in measures if (m.on_blocks, m.below) == (kind, below)] for kind in (False, True)
+        )
+        blocks = _judged(nothing, terrain, params.sigmas, on_blocks, (noise, doubt))
+        return _judged(Verdicts(*(spread(a) for a in blocks)), terrain, params.sigmas, on_cells, wide)
+
+    wheel, body = judged(below=False), judged(below=True)
+    load, excess = np.maximum(wheel.load, body.load), np.maximum(wheel.excess, body.excess)
+    over, p, p_wheel = wheel.over | body.over, _chance(excess), _chance(wheel.excess)
     # A hazard that is proven by a part of the window stays one, however little is known.
     known = ~np.isnan(terrain.closed)
     hazardous = known & (load > 1)
@@ -151,7 +159,7 @@ def classify(
     for m in measures:
         band = _band(m, values.pop(m.name), terrain.vehicle.clearance)
         out[m.band] = np.where(unknown, np.float32(np.nan), spread(band) if m.on_blocks else band)
-    return out | {"p_hazard": np.where(unknown, np.float32(np.nan), p)}
+    return out | {name: np.where(unknown, np.float32(np.nan), a) for name, a in (("p_hazard", p), ("p_wheel", p_wheel))}
 
 
 def _judged(
@@ -188,6 +196,12 @@ def _band(m: Measure, values: Floats32, most: float) -> Floats32:
     if m.left:
         return np.subtract(np.float32(most), values)
     return np.arctan(values, out=values) if m.in_degrees else values
+
+
+def _chance(excess: Floats32) -> Floats32:
+    """F of the greatest excess (row, col)."""
+    steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
+    return _table()[steps.astype(np.intp)]
 
 
 @cache

@@ -79,7 +79,7 @@ def risk_map(
     -------
     ``risk`` uint8 (0 safe, 1 caution, 2 hazard, 3 unknown), ``reason`` uint16 bits; float32, NaN where unknown:
     ``inclination``, ``slope``, ``tilt`` rad, ``height_range``, ``step``, ``roughness``, ``clearance`` (left under the
-    belly) m, ``p_hazard``; ``filled`` uint8, ``elevation`` float32 m (closed).
+    belly) m, ``p_hazard``, ``p_wheel``; ``filled`` uint8, ``elevation`` float32 m (closed).
 
     Raises
     ------
@@ -116,12 +116,13 @@ def window_cells(side: float, cell: float) -> int:
 
 @stage(
     "risk",
-    version=5,
+    version=6,
     outputs=[
         raster("risk", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown", "uint8", ""),
         raster("reason", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items()), "uint16", ""),
         *(raster(m.band, "rad" if m.in_degrees else "m", m.description) for m in MEASURES),
         raster("p_hazard", "1", "probability that a measure exceeds its limit"),
+        raster("p_wheel", "1", "probability that a measure of the wheel's window exceeds its limit"),
         raster("filled", "1", "1 where the elevation was interpolated", "uint8", ""),
         raster("elevation", "m", "elevation with small holes closed"),
     ],

@@ -137,41 +137,43 @@ class Hazards(NamedTuple):
     """Maps (row, col) of hazards, and of how well the ground is known.
 
     ``risk``: classes of :mod:`rille.stages.hazard.risk`; ``reason`` bits, without which every hazard is one to a wheel;
-    ``p_hazard``, without which each is certain. ``unknown``: cells on which the vehicle may not stand because too
-    little is known; None: those of the unknown class. ``glanced``: unknown cells that were seen from afar. ``doubted``:
-    cells that cost as much as a hazard by sigma alone that is driven on.
+    ``p_hazard``, without which each is certain, and ``p_wheel`` of those to a wheel, without which it is ``p_hazard``.
+    ``unknown``: cells on which the vehicle may not stand because too little is known; None: those of the unknown class.
+    ``glanced``: unknown cells that were seen from afar. ``doubted``: cells that cost a wheel as much as a hazard by
+    sigma alone that is driven on.
     """
 
     risk: Bytes
     reason: NDArray[np.uint16] | None = None
     p_hazard: Floats32 | None = None
+    p_wheel: Floats32 | None = None
     unknown: Bools | None = None
     glanced: Bools | None = None
     doubted: Bools | None = None
 
 
 class ClearanceFields(NamedTuple):
-    """Distances (row, col), m, to hazards that are none by sigma alone, to those that are, and to proven ones."""
+    """Maps (row, col) of a part of the vehicle: distances, m, to hazards that are none by sigma alone, to those that
+    are, and to proven ones; ``cost_class``: 0 (clear), :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`."""
 
     likely: Floats32
     doubtful: Floats32
     proven: Floats32
+    cost_class: Bytes
 
 
 class FootingMaps(NamedTuple):
     """Maps (row, col) as a vehicle meets them, distances in metres.
 
-    ``wheels``, ``body``: distances to hazards to a wheel, and to the vehicle. ``unknown``: distance to unknown ground;
-    ``frontier``: to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``cost_class``: 0
-    (clear), :data:`CAUTION_GROUND` or :data:`DOUBTED_GROUND`. ``straddle``: unknown ground over which the belly may
-    pass.
+    ``wheels``, ``body``: hazards to a wheel, and to the vehicle. ``unknown``: distance to unknown ground;
+    ``frontier``: to that of it where a wheel has room, for the rest is mostly the shadows of stones. ``straddle``:
+    unknown ground over which the belly may pass.
     """
 
     wheels: ClearanceFields
     body: ClearanceFields
     unknown: Floats32
     frontier: Floats32
-    cost_class: Bytes
     straddle: Straddle
 
 
@@ -217,30 +219,34 @@ class Footing:
 
         A hazard is proven where it is not one by its standard deviation alone, and at least as probable as
         ``p_certain``. Where it is one by its standard deviation alone and less probable than ``p_traversable``, the
-        ground is doubted, if it is not unknown. So is ground within a quarter of a wheel of the doubted cells,
-        where a wheel's edge touches.
+        ground is doubted, if it is not unknown. To wheels so is ground within a quarter of a wheel of the doubted
+        cells, where a wheel's edge touches. A wheel's doubts are none of the middle's, which may pass over a stone.
         """
         risk, cell = hazards.risk, lattice.cell
         hazardous = risk == HAZARDOUS
         unknown = risk == UNKNOWN if hazards.unknown is None else hazards.unknown
         bits = np.full(risk.shape, WHEEL_BITS) if hazards.reason is None else hazards.reason
-        doubtful = hazardous & ((bits & DOUBT_BIT) > 0)
-        # Without probabilities every hazard that is none by sigma alone is proven.
-        likely = proven = hazardous & ~doubtful
-        cost_class = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
-        if hazards.p_hazard is not None:
-            proven = likely & (hazards.p_hazard >= p_certain)
-            dared = doubtful & (hazards.p_hazard < p_traversable)
-            doubtful &= ~dared
-            cost_class[dared & ~unknown] = DOUBTED_GROUND
-        if hazards.doubted is not None:
-            beside = distance(hazards.doubted, cell) <= 0.25 * vehicle.wheel_diameter
-            cost_class[beside & ~unknown] = DOUBTED_GROUND
-        masks = likely, doubtful, proven
-        wheels, body = (
-            ClearanceFields(*(distance(mask & ((bits & which) > 0), cell) for mask in masks))
-            for which in (WHEEL_BITS, BODY_BITS)
-        )
+        by_sigma = (bits & DOUBT_BIT) > 0
+
+        def part(which: np.uint16, chance: Floats32 | None, doubted: Bools | None) -> ClearanceFields:
+            mine = hazardous & ((bits & which) > 0)
+            doubtful = mine & by_sigma
+            # Without probabilities every hazard that is none by sigma alone is proven.
+            likely = proven = mine & ~by_sigma
+            cost_class = np.where(risk == CAUTION, np.uint8(CAUTION_GROUND), np.uint8(0))
+            if chance is not None:
+                proven = likely & (chance >= p_certain)
+                dared = doubtful & (chance < p_traversable)
+                doubtful &= ~dared
+                cost_class[dared & ~unknown] = DOUBTED_GROUND
+            if doubted is not None:
+                beside = distance(doubted, cell) <= 0.25 * vehicle.wheel_diameter
+                cost_class[beside & ~unknown] = DOUBTED_GROUND
+            likely_m, doubtful_m, proven_m = (distance(mask, cell) for mask in (likely, doubtful, proven))
+            return ClearanceFields(likely_m, doubtful_m, proven_m, cost_class)
+
+        p_wheel = hazards.p_hazard if hazards.p_wheel is None else hazards.p_wheel
+        wheels, body = part(WHEEL_BITS, p_wheel, hazards.doubted), part(BODY_BITS, hazards.p_hazard, None)
         wide = _opened(unknown, 0.5 * vehicle.wheel_diameter, cell)
         # Where lines of sight bound the hidden ground, the belly may pass; elsewhere unknown ground is a void to it.
         nothing = np.full(risk.shape, np.nan, np.float32)
@@ -248,7 +254,7 @@ class Footing:
         void = distance(unknown & np.isnan(bounds.upper), cell)
         straddle = Straddle.of(void, bounds, vehicle, _belly(vehicle), cell)
         unseen, frontier = distance(unknown, cell), distance(wide, cell)
-        maps = FootingMaps(wheels, body, unseen, frontier, cost_class, straddle)
+        maps = FootingMaps(wheels, body, unseen, frontier, straddle)
         return Footing(lattice, vehicle, maps, hazards.glanced)
 
     def gaps(self, x: Floats, y: Floats, heading: Floats) -> Gaps:
@@ -321,8 +327,8 @@ def _gaps(poses, parts, maps, out):  # type: ignore[no-untyped-def]
         # The middle keeps off cells hazardous to the vehicle, the wheels keep off those hazardous to wheels.
         gap, doubtful, proven = maps.body.likely[i, j], maps.body.doubtful[i, j], maps.body.proven[i, j]
         cautious, doubted = (
-            int(maps.cost_class[i, j] == CAUTION_GROUND),
-            int(maps.cost_class[i, j] == DOUBTED_GROUND),
+            int(maps.body.cost_class[i, j] == CAUTION_GROUND),
+            int(maps.body.cost_class[i, j] == DOUBTED_GROUND),
         )
         spare = maps.unknown[i, j] - parts.radius
         inside, unknown, frontier = True, np.float32(np.inf), np.float32(np.inf)
@@ -334,8 +340,8 @@ def _gaps(poses, parts, maps, out):  # type: ignore[no-untyped-def]
             stand[k, 0], stand[k, 1] = i, j
             gap, doubtful = min(gap, maps.wheels.likely[i, j]), min(doubtful, maps.wheels.doubtful[i, j])
             proven = min(proven, maps.wheels.proven[i, j])
-            cautious += maps.cost_class[i, j] == CAUTION_GROUND
-            doubted += maps.cost_class[i, j] == DOUBTED_GROUND
+            cautious += maps.wheels.cost_class[i, j] == CAUTION_GROUND
+            doubted += maps.wheels.cost_class[i, j] == DOUBTED_GROUND
             unknown = min(unknown, maps.unknown[i, j] - parts.margin)
             frontier = min(frontier, maps.frontier[i, j] - parts.margin)
         if inside and spare > 0:

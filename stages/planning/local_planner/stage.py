@@ -34,10 +34,10 @@ from rille.stages.terrain.occlusion_bounds import Bounds
 Point = tuple[float, float]
 
 
-HAZARD_MAPS = ("risk", "reason", "p_hazard")
-MIN_DOUBTED_PROBABILITY = 0.06
-"""Probability of a hazard from which near ground is doubted; on simulated beds all edges that the map missed lay on
-ground of 0.07 and more."""
+HAZARD_MAPS = ("risk", "reason", "p_hazard", "p_wheel")
+MIN_DOUBTED_PROBABILITY = 0.02
+"""Probability of a hazard to a wheel from which near ground is doubted: 5 % of the ground on which wheels may stand,
+with all but 4 of 170 edges that the map missed (beds 1 to 9 of ``benchmarks/loop.py`` at 10 %)."""
 MAX_CLEAR_PROBABILITY = 0.02
 """Probability of a hazard below which ground seen from afar alone may be driven on; of such places for a wheel 0.005 %
 had an edge that the map missed, of all places 0.37 %."""
@@ -113,7 +113,8 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
         # Written so that NaN, of which nothing is known, stays unknown.
         unknown &= ~(maps[2] < MAX_CLEAR_PROBABILITY)
         glanced = unknown & (maps[0] < HAZARDOUS)
-    return Hazards(maps[0], maps[1], maps[2], unknown, glanced, maps[2] >= MIN_DOUBTED_PROBABILITY)
+    risk, reason, p_hazard, p_wheel = maps
+    return Hazards(risk, reason, p_hazard, p_wheel, unknown, glanced, p_wheel >= MIN_DOUBTED_PROBABILITY)
 
 
 def _stands(poses: Floats, T_vehicle_left: RigidTransform) -> list[Stand]:
@@ -136,7 +137,7 @@ class LegInputs(NamedTuple):
 
 @stage(
     "local_planner",
-    version=12,
+    version=13,
     outputs=[
         Array(
             "path",

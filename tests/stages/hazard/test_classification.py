@@ -67,6 +67,12 @@ def test_classes_and_reasons_equal_a_plain_calculation(stride: int) -> None:
     np.testing.assert_array_equal(np.isnan(out["tilt"]), unknown)
     np.testing.assert_allclose(out["tilt"][~unknown], np.arctan(values["tilt"])[~unknown], rtol=1e-6)
     assert 0 < hazard.mean() < 0.9
+    # Both probabilities are one rising function, of all measures and of the wheel's.
+    wheels = [m for m in MEASURES if not m.below]
+    alone = classify(terrain, np.zeros(shape, np.uint8), RULES, tuple(wheels))
+    known = ~unknown & (alone["risk"] != UNKNOWN)
+    np.testing.assert_array_equal(out["p_wheel"][known], alone["p_hazard"][known])
+    assert (out["p_wheel"] <= out["p_hazard"])[known].all()
 
 
 def test_a_new_measure_is_one_row_and_its_kernel() -> None:

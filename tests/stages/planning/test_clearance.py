@@ -138,10 +138,26 @@ def test_what_is_hazardous_by_sigma_alone_and_improbable_is_doubted_ground() -> 
     assert (not_so.gap[0], not_so.doubtful[0], not_so.doubted[0], not_so.caution[0]) == (np.inf, 0.0, 0, 0)
 
 
+def test_what_a_wheel_meets_is_doubted_below_the_wheels_alone() -> None:
+    risk, here = np.full(LATTICE.shape, SAFE, np.uint8), np.zeros((3, 1))
+    middle, wheel = (np.hypot(X - x, Y - y) < 0.01 for x, y in ((0.0, 0.0), (0.04, 0.05)))
+    for doubted, count in ((middle, 0), (wheel, 1)):
+        assert Footing.of(Hazards(risk, doubted=doubted), LATTICE, ROVER).gaps(*here).doubted[0] == count
+
+
+def test_whether_a_wheel_may_be_dared_does_not_depend_on_how_the_vehicle_would_stand() -> None:
+    risk = np.where(np.hypot(X - 0.04, Y - 0.05) < 0.01, np.uint8(HAZARDOUS), np.uint8(SAFE))
+    reason = np.full(risk.shape, REASONS["step"] | REASONS["uncertain"], np.uint16)
+    standing, wheel = np.full(risk.shape, 0.4, np.float32), np.full(risk.shape, 0.2, np.float32)
+    hazards, here = Hazards(risk, reason, standing, wheel), np.zeros((3, 1))
+    gaps = Footing.of(hazards, LATTICE, ROVER, p_certain=0.9, p_traversable=0.3).gaps(*here)
+    assert (gaps.doubtful[0], gaps.doubted[0]) == (np.inf, 1)
+
+
 def test_ground_within_a_quarter_of_a_wheel_of_doubted_ground_is_dear() -> None:
     risk = np.full(LATTICE.shape, SAFE, np.uint8)
     unknown = Y > 0.2
     footing = Footing.of(Hazards(risk, unknown=unknown, doubted=X > 0.059), LATTICE, ROVER)
     assert np.array_equal(
-        footing.maps.cost_class == DOUBTED_GROUND, (X > 0.054) & ~unknown
+        footing.maps.wheels.cost_class == DOUBTED_GROUND, (X > 0.054) & ~unknown
     )  # a cell of 5 mm beside it, not the next

@@ -56,7 +56,8 @@ def test_over_a_hole_between_walls_it_goes_where_lines_of_sight_pass_low_enough(
     meta = {"lattice": LATTICE.to_dict(), "vehicle": ROVER.model_dump(mode="json")}
     chance = np.where(risk == HAZARDOUS, np.float32(1.0), np.float32(0.0))
     chance[hole] = np.nan
-    maps = {"risk": risk, "reason": np.full(risk.shape, REASONS["step"], np.uint16), "p_hazard": chance}
+    maps = {"risk": risk, "reason": np.full(risk.shape, REASONS["step"], np.uint16)}
+    maps |= {"p_hazard": chance, "p_wheel": chance}
     seen = np.where(hole, np.nan, 0.0).astype(np.float32)
 
     def driven(top: float) -> Leg:
@@ -274,7 +275,7 @@ def test_a_metre_close_to_uncertain_ground_costs_more() -> None:
 def judged(hazardous: np.ndarray, chance: float) -> Bundle:
     risk = np.where(hazardous, np.uint8(HAZARDOUS), np.uint8(SAFE))
     maps = {"risk": risk, "reason": np.where(hazardous, np.uint16(REASONS["step"]), np.uint16(0))}
-    maps["p_hazard"] = np.where(hazardous, chance, 0.0).astype(np.float32)
+    maps["p_hazard"] = maps["p_wheel"] = np.where(hazardous, chance, 0.0).astype(np.float32)
     return Bundle(maps, {"lattice": LATTICE.to_dict(), "vehicle": ROVER.model_dump(mode="json")})
 
 
@@ -343,7 +344,12 @@ def test_no_wheel_is_driven_over_doubtful_ground_that_can_be_gone_round() -> Non
 @pytest.mark.parametrize(("chance", "kind"), [(0.19, HAZARDOUS), (0.01, SAFE)])
 def test_at_the_rim_of_what_is_near_only_what_is_clearly_free_from_afar_counts(chance: float, kind: int) -> None:
     def seen(risk: int, reason: int, p: float) -> Bundle:
-        maps = {"risk": np.uint8(risk), "reason": np.uint16(reason), "p_hazard": np.float32(p)}
+        maps = {
+            "risk": np.uint8(risk),
+            "reason": np.uint16(reason),
+            "p_hazard": np.float32(p),
+            "p_wheel": np.float32(p),
+        }
         return Bundle({name: np.full((2, 2), value) for name, value in maps.items()}, {})
 
     near = seen(HAZARDOUS, REASONS["slope"] | REASONS["uncertain"] | REASONS["unseen"], 0.45)
