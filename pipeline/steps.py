@@ -209,8 +209,10 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
     check_sections(settings)
     for section, values in settings.items():
         for name, value in values.items():
+            # Sweeps are often NumPy's numbers.
+            plain = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
             try:
-                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
+                lines = tomli_w.dumps({"v": plain}).removeprefix("v = ").splitlines()
             except TypeError:
                 text = f"{section}.{name} = {value!r} is no value of TOML"
                 remedy = "give a number, a text, True or False, or a list of these; or leave it out"

@@ -10,7 +10,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypedDict, cast, get_ar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
 from typing_extensions import TypeVar
 
 AnyArray = NDArray[Any]
@@ -34,6 +34,14 @@ class Params(BaseModel):
     """Base of all parameter models: frozen, unknown keys refused, no infinities."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse a switch where a number is expected: pydantic would take True for 1."""
+        if isinstance(value, bool) and "bool" not in str(cls.model_fields[str(info.field_name)].annotation):
+            raise ValueError("input should be a number, no switch")
+        return value
 
 
 class NoParams(Params):

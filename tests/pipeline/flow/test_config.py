@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from raising import raises
 
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.flow import config
+from rille.pipeline.steps import assignments
 
 
 def test_layers_win_in_order() -> None:
@@ -121,3 +123,15 @@ def test_a_section_and_dotted_keys_of_it_are_one():
     assert config.expand({"locus": {"both": True}, "locus.cell_size": 0.1}) == {
         "locus": {"both": True, "cell_size": 0.1}
     }
+
+
+def test_a_switch_is_no_number():
+    with raises("RIL-027", "locus.cell_size", "no switch"):
+        config.build({"locus": {"cell_size": True}})
+    assert config.build({"locus": {"both": False}}).locus.both is False
+
+
+def test_numbers_of_numpy_are_numbers():
+    given = {"locus": {"cell_size": np.float64(0.004)}, "track": {"points": np.int64(50)}}
+    built = config.build(config.parse_assignments(assignments(given)))
+    assert (built.locus.cell_size, built.track.points) == (0.004, 50)
