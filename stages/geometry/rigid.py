@@ -9,7 +9,7 @@ doi:10.1109/34.88573, without scale).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -86,6 +86,39 @@ def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     u[:, -1] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = u @ vt
     return rotation, b - rotation @ a
+
+
+class Fit(NamedTuple):
+    """Truth moved into the world: (frame, 2 or 3) m; ``error``: RMS, m; ``relative``: over the extent of the tracks."""
+
+    moved: Floats
+    error: float
+    relative: float
+
+
+def fit_rigid(estimate: Floats, truth: Floats, upright: bool = True) -> Fit:
+    """Truth (frame, 2 or 3) turned and shifted to the estimated positions (frame, 3), m.
+
+    It is turned about the vertical alone where the world is ``upright``, i.e. its vertical was measured, and where the
+    truth has no heights. Rows of NaN in either do not count, but are moved as well.
+    """
+    width = truth.shape[1]
+    both = in_both(estimate, truth)
+    if not both.any():
+        return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
+    centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
+    a, b = estimate[:, :width] - centre, truth - origin
+    turned = 2 if upright else width
+    b[:, :turned] = b[:, :turned] @ umeyama(b[both, :turned], a[both, :turned])[0].T
+    error = rms(a[both] - b[both])
+    # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
+    extent = np.hypot(rms(a[both]), rms(b[both]))
+    return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
+
+
+def in_both(estimate: Floats, truth: Floats) -> Bools:
+    """Frames (frame,) that have an estimated (frame, 3) and a true position (frame, 2 or 3)."""
+    return np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1))
 
 
 def spread(poses: Floats) -> float:

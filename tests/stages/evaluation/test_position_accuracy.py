@@ -12,10 +12,10 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.evaluation.position_accuracy import (
     TruePositions,
     find_offset,
-    fit_rigid,
     position_accuracy,
     position_accuracy_stage,
 )
+from rille.stages.geometry.rigid import fit_rigid
 
 RATE = 10.0
 MOMENTS = np.arange(80) / RATE
