@@ -93,13 +93,18 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
 
     def posed_by(use: NDArray[np.intp], j: int) -> Resection:
         pixels, landmarks = points.tracks[use, j].astype(np.float64), points.landmarks.take(use)
-        agreeing, bound = 0, CONTRADICTION * params.threshold
+        bound = CONTRADICTION * params.threshold
+
+        def without_zoom(agreeing: int) -> None:
+            refuse_zoom(landmarks.position, pixels, points.camera, agreeing, bound, frames[j])
+
         try:
             posed = resect(landmarks, pixels, points.camera, [last], params, frames[j])
-            agreeing = int((posed.residual <= bound).sum())
-        finally:
-            # Also where no pose is found: a zoom is the cause then.
-            refuse_zoom(landmarks.position, pixels, points.camera, agreeing, bound, frames[j])
+        except DegenerateError:
+            # Where no pose is found a zoom is the cause rather than what is said of its landmarks.
+            without_zoom(0)
+            raise
+        without_zoom(int((posed.residual <= bound).sum()))
         return posed
 
     for j in range(1, len(frames)):
