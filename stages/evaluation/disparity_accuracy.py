@@ -12,14 +12,12 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
+from rille.stages.evaluation.coverage import within
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
 THRESHOLDS_PX = (1, 2, 4)
 """An error beyond these counts as bad: bad-1, bad-2, bad-4."""
-
-SIGMAS = (1, 2)
-"""Standard deviations within which errors are counted."""
 
 
 def filled(column: Floats32, match: Bools) -> Floats32:
@@ -55,7 +53,6 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     counts = f"{error.size} of {every.size} pixels with truth"
     of_matched = f"of the matched pixels; {counts}"
     of_all = f"of all pixels, filled along rows where not matched; {every.size} pixels with truth"
-    claimed = sigma[both]
     figures = {
         "median": metric(float(np.median(error)) if error.size else None, "px", f"median error {of_matched}"),
         "completeness": metric(
@@ -69,11 +66,7 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
         figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
-    for count in SIGMAS:
-        share = float(np.mean(error <= count * claimed)) if error.size else None
-        how = f"share within {count} standard deviation{'s' * (count > 1)} of the disparity, {of_matched}"
-        figures[f"within_{count}_sigma"] = metric(share, "1", how)
-    return figures
+    return figures | within(error, sigma[both], f"of the disparity, {of_matched}")
 
 
 @stage(
