@@ -16,4 +16,4 @@ from rille.stages.geometry.geometry import Rig
 def calibration_stage(params: NoParams, rig: Bundle[RigFacts]) -> Bundle[CalibrationFacts]:
     """The rig that is computed with."""
     used = Rig.from_dict(rig.meta["rig"])
-    return Bundle({}, {"rig": used.to_dict(), "baseline": used.baseline})
+    return Bundle({}, {"rig": used.to_dict(), "baseline": used.baseline, "changed": rig.meta["changed"]})

@@ -6,10 +6,11 @@ from rille.stages.core.declare import Facts
 
 
 class CalibrationFacts(Facts):
-    """``rig`` (:meth:`Rig.to_dict`) that is computed with, and its ``baseline``, m."""
+    """``rig`` (:meth:`Rig.to_dict`) that is computed with, its ``baseline``, m, and whether it was ``changed``."""
 
     rig: dict[str, Any]
     baseline: float
+    changed: NotRequired[bool]
 
 
 class OrientationFacts(Facts):

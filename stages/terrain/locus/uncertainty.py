@@ -7,8 +7,8 @@ It is a sum of variances. With s the pixels of disparity a metre of elevation,
 
 times 2 - v where the ground turns away from the left camera, v < 1.
 
-t: the step of Z from cell to cell (RMS of 3 x 3 cells), A: the pixels that a cell covers, so that t / sqrt(A) is the step
-from pixel to pixel; since a position that is wrong by a part of a cell, or of a pixel where cells are finer, is an
+t: the step of Z from cell to cell (RMS of 3 x 3 cells), A: the pixels that a cell covers, so that t / sqrt(A) is the
+step from pixel to pixel; since a position that is wrong by a part of a cell, or of a pixel where cells are finer, is an
 elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
 the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the differences of
 the whole pair (robust), g: the grey value. In a shadow the gradients are those of noise, so the grey value stands for
