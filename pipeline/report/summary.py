@@ -50,6 +50,7 @@ def collect(view: RunView) -> dict[str, Any]:
             *view.sequence.notes,
             *delivery.coverage(view),
             *delivery.moved(view),
+            *delivery.unmeasured_vertical(view),
             *given_numbers(view),
             *resting(view),
         ],
