@@ -252,9 +252,9 @@ def unmeasured_vertical(view: RunView) -> list[str]:
     if sources != {GROUND_PLANE} or view.bundle(view.products.world_risk) is None:
         return []
     return [
-        "Nothing states the vertical, so the plane of the ground that is seen counts as level: a slope that all of it has is "
-        "neither in the elevations nor in inclinations, risk and path. world.pitch_deg, world.up, an attitude or an "
-        "IMU in a manifest gives the vertical."
+        "Nothing states the vertical, so the plane of the ground that is seen counts as level: a slope that all of it "
+        "has is neither in the elevations nor in inclinations, risk and path. world.pitch_deg, world.up, an attitude "
+        "or an IMU in a manifest gives the vertical."
     ]
 
 
