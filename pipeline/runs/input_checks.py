@@ -104,7 +104,8 @@ LIMITS = {
             "RIL-907",
             "borne out",
             least=0.1,
-            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), and of this sign?",
+            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
+            "rows in order (PFM has the lowest first)?",
         ),
         Fault("RIL-656", "matched", least=0.02, remedy="do both images show one scene, taken at one time, and sharp?"),
         InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
