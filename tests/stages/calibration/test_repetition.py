@@ -26,8 +26,10 @@ def test_matches_on_a_pattern_that_repeats_are_doubted(rows: bool) -> None:
     assert judge_repetition(facts["repeated"]).level == ("WARN" if rows else "OK")
 
 
-def test_pairs_without_matches_repeat_nothing() -> None:
-    none = Bundle({"left": np.zeros((0, 2), np.float32), "right": np.zeros((0, 2), np.float32)}, {})
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 30])
+def test_pairs_of_few_matches_repeat_nothing(count: int) -> None:
+    # All on one line, which determines no epipolar geometry.
+    left = np.stack([np.arange(count), np.full(count, 15)], 1).astype(np.float32)
     image = Bundle({"image": np.zeros((30, 30), np.float32)}, {})
-    ports = {"left": [image], "right": [image], "orientations": [none]}
+    ports = {"left": [image], "right": [image], "orientations": [Bundle({"left": left, "right": left}, {})]}
     assert repetition_stage.run(NoParams(), {}, ports).meta == {"repeated": 0.0}
