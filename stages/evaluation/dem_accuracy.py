@@ -15,6 +15,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.coverage import within
 from rille.stages.evaluation.dem_comparison import figures
 from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric
 from rille.stages.geometry.lattice import Lattice, mosaic
@@ -28,20 +29,22 @@ ERRORS: Mapping[str, str] = {
 """Descriptions of the figures of :func:`rille.stages.evaluation.dem_comparison.figures` that are stated."""
 
 
-def dem_accuracy(elevation: Floats32, truth: Floats32, judged: Bools) -> dict[str, Metric]:
+def dem_accuracy(elevation: Floats32, std: Floats32, truth: Floats32, judged: Bools) -> dict[str, Metric]:
     """Metrics by name.
 
     Parameters
     ----------
-    elevation, truth : (row, col) metres, NaN unknown.
+    elevation, std, truth : (row, col) metres, NaN unknown.
     judged : (row, col) the cells that count: seen by both cameras, and in the window.
     """
     judged = judged & np.isfinite(truth)
-    wanted, error = int(judged.sum()), figures((elevation.astype(np.float64) - truth)[judged])
+    errors = (elevation.astype(np.float64) - truth)[judged]
+    given, wanted, error = np.isfinite(errors), errors.size, figures(errors)
     how = f"{error['cells']:.0f} of {wanted} cells that both cameras see"
-    share = metric(error["cells"] / wanted if wanted else None, "1", f"share given: {how}")
-    return {name: metric(error.get(name), "m", f"{what}, {how}") for name, what in ERRORS.items()} | {
-        "completeness": share
+    return {
+        **{name: metric(error.get(name), "m", f"{what}, {how}") for name, what in ERRORS.items()},
+        "completeness": metric(error["cells"] / wanted if wanted else None, "1", f"share given: {how}"),
+        **within(np.abs(errors[given]), std[judged][given], f"of the elevation, {how}"),
     }
 
 
@@ -55,20 +58,23 @@ def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     return (x >= x_min - slack) & (x <= x_max + slack) & (y >= y_min - slack) & (y <= y_max + slack)
 
 
-@stage("dem_accuracy", version=2, outputs=[raster("error", "m", "elevation minus truth")])
+@stage("dem_accuracy", version=3, outputs=[raster("error", "m", "elevation minus truth")])
 def dem_accuracy_stage(
     params: NoParams, dem: Sequence[Bundle], truth: Bundle, *, window: list[float] | None = None
 ) -> Bundle[DemAccuracyFacts]:
-    """Elevation model against truth: RMSE, NMAD, 95 %, bias and completeness."""
+    """Elevation model against truth: RMSE, NMAD, 95 %, bias, completeness, and how often its sigma holds."""
     lattice = Lattice.from_dict(truth.meta["lattice"])
-    parts = [(Lattice.from_dict(one.meta["lattice"]), np.asarray(one["elevation"])) for one in dem]
+    parts = [(Lattice.from_dict(one.meta["lattice"]), one) for one in dem]
     if not parts:
         raise InputError("RIL-320", "no elevation model to compare with truth")
-    elevation = mosaic(parts, np.nan, lattice)
+    elevation, std = (
+        mosaic([(grid, np.asarray(one[name])) for grid, one in parts], np.nan, lattice)
+        for name in ("elevation", "elevation_std")
+    )
     true = np.asarray(truth["elevation"])
     seen, inside = np.asarray(truth["seen"]) != 0, in_window(lattice, window)
     error = (elevation - true).astype(np.float32)
-    metrics = dem_accuracy(elevation, true, seen & inside)
+    metrics = dem_accuracy(elevation, std, true, seen & inside)
     unseen = np.isfinite(elevation) & ~seen & inside
     metrics["unseen"] = metric(int(unseen.sum()), "cells", "cells given that not both cameras see")
     if "tilt_deg" in truth.meta:

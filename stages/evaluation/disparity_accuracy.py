@@ -12,6 +12,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
+from rille.stages.evaluation.coverage import within
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
@@ -23,9 +24,6 @@ MIN_MATCHES = 100
 
 FITS_PX = 2.0
 """Pixels: a match that is off by less fits the truth."""
-
-SIGMAS = (1, 2)
-"""Standard deviations within which errors are counted."""
 
 
 def filled(column: Floats32, match: Bools) -> Floats32:
@@ -61,7 +59,6 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     counts = f"{error.size} of {every.size} pixels with truth"
     of_matched = f"of the matched pixels; {counts}"
     of_all = f"of all pixels, filled along rows where not matched; {every.size} pixels with truth"
-    claimed = sigma[both]
     figures = {
         "median": metric(float(np.median(error)) if error.size else None, "px", f"median error {of_matched}"),
         "completeness": metric(
@@ -75,11 +72,7 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
         figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
-    for count in SIGMAS:
-        share = float(np.mean(error <= count * claimed)) if error.size else None
-        how = f"share within {count} standard deviation{'s' * (count > 1)} of the disparity, {of_matched}"
-        figures[f"within_{count}_sigma"] = metric(share, "1", how)
-    return figures
+    return figures | within(error, sigma[both], f"of the disparity, {of_matched}")
 
 
 def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
@@ -99,7 +92,10 @@ def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
             f"times {factor:.2g}{turned}": rows * factor,
             f"{offset:+.0f} px{turned}": rows + offset,
         }
-    fits = {words: float(np.mean(np.abs(column - map_)[match] < FITS_PX)) for words, map_ in readings.items()}
+    fits = {
+        words: float(np.mean(np.abs(column - map_)[match & np.isfinite(map_)] < FITS_PX))
+        for words, map_ in readings.items()
+    }
     # Of readings that fit alike, as of a plane upside down, the plainest.
     as_given, best = fits["as it is"], next(words for words in fits if fits[words] > max(fits.values()) - 0.02)
     # Of right matches most fit; of wrong ones half do not by any reading.

@@ -77,7 +77,11 @@ MIN_CHANGE = 0.004
 
 MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
-(:class:`rille.stages.calibration.parameter_selection.RelativeParams`)."""
+(:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
+
+MIN_YAW_SEGMENTS = 2
+"""Segments below which the prior of the yaw decides: two that agree; each says it far better than a turn says the
+numbers of a camera."""
 
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
@@ -296,7 +300,7 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
     )
 
 
-@stage("intrinsics", version=3)
+@stage("intrinsics", version=4)
 def intrinsics_stage(
     params: IntrinsicsParams,
     segments: Sequence[Bundle[ResectFacts]],
@@ -323,10 +327,10 @@ def intrinsics_stage(
         params.sigma,
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
-    shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / focal
-    # The yaw has the prior of the rig's other angles.
-    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([0.1 * params.prior]), least)
+    shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_YAW_SEGMENTS]).reshape(-1, 2, 1)
+    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta.get("changed") else MIN_YAW_PX) / focal
+    # Any yaw is as likely: drawn to none by a prior, few segments that agree would seem to contradict each other.
+    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:

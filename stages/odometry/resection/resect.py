@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bytes, Floats
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, stage
 from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import CalibrationFacts
@@ -170,34 +170,6 @@ def adjust_segment(
     }
 
 
-def knocked(points: SegmentPoints, segment: SegmentPoses, after: Bundle, rig: Rig) -> tuple[str, list[float]] | None:
-    """A line and a jump where the basic pair at the segment's end contradicts the landmarks: the rig has moved.
-
-    The jump is in pixels of the coarser image. A turn of a camera to the side shows in no row of one pair, but all its
-    disparities jump by as much.
-
-    Parameters
-    ----------
-    after, rig : disparity and rig of that pair.
-    """
-    pose = segment.poses[-1]
-    unit = right_pixels(rig)
-    disparity, matched, _ = matches_at(points.tracks[:, -1].astype(np.float64), after, unit)
-    use = matched & (segment.inlier[:, -1] != 0)
-    if not np.isfinite(pose).all() or use.sum() < MIN_LANDMARKS:
-        return None
-    at = RigidTransform.from_matrix(pose).inverse().apply(points.landmarks.position[use])
-    expected = rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)
-    jump = np.median(disparity[use] - expected, axis=0) / unit
-    if np.linalg.norm(jump) <= MIN_JUMP_PX:
-        return None
-    line = (
-        f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
-        f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"
-    )
-    return line, jump.tolist()
-
-
 class ResectInputs(NamedTuple):
     """Tracks of a segment; vertical, rig and disparity of its basic pair; disparity and rig of the pair at its end."""
 
@@ -209,9 +181,42 @@ class ResectInputs(NamedTuple):
     rig_after: Bundle[CalibrationFacts] | None = None
 
 
+def knocked(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> tuple[str, list[float]] | None:
+    """A line and a jump where the basic pair at the segment's end contradicts its own: the rig has moved.
+
+    The jump is in pixels of the coarser image. A turn of a camera to the side shows in no row of one pair, but all its
+    disparities jump by as much. A turn of both pairs alike is none: the disparities of both are compared with the
+    landmarks as they were adjusted.
+
+    Parameters
+    ----------
+    tracks : (point, frame, 2) pixels of the left images.
+    """
+    if inputs.after is None or inputs.rig_after is None or not np.isfinite(segment.poses[[0, -1]]).all():
+        return None
+    before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
+    unit = right_pixels(then)
+    use, off = segment.inlier[:, -1] != 0, []
+    for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
+        disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
+        at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)
+        use &= matched
+        off.append(disparity - (rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)))
+    if use.sum() < MIN_LANDMARKS:
+        return None
+    jump = (np.median(off[1][use], axis=0) - np.median(off[0][use], axis=0)) / unit
+    if np.linalg.norm(jump) <= MIN_JUMP_PX:
+        return None
+    line = (
+        f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
+        f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"
+    )
+    return line, jump.tolist()
+
+
 @stage(
     "resect",
-    version=5,
+    version=6,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),
@@ -245,11 +250,9 @@ def resect_stage(
     if params.joint:
         opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
         meta["intrinsics"] = adjust_segment(points, segment, SegmentCameras(rig, opened, T_local_key), params)
-    if inputs.after is not None and inputs.rig_after is not None:
-        jumped = knocked(points, segment, inputs.after, Rig.from_dict(inputs.rig_after.meta["rig"]))
-        if jumped is not None:
-            meta["knocked"], meta["jump"] = jumped
-            meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
+    if (jumped := knocked(tracks, segment, inputs)) is not None:
+        meta["knocked"], meta["jump"] = jumped
+        meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
     for line in [fact["contradiction"] for fact in segment.facts if "contradiction" in fact]:
         meta["contradiction"], meta["warnings"] = line, [line]
     return Bundle({name: value for name, value in vars(segment).items() if name != "facts"}, meta)

@@ -114,7 +114,7 @@ def bundles() -> dict[str, Bundle]:
         ),
     }
     error = np.where(np.isfinite(z), 4e-4, np.nan).astype(np.float32)
-    judged = dem_accuracy(z, z - error, np.ones(z.shape, dtype=bool))
+    judged = dem_accuracy(z, np.full_like(z, 3e-4), z - error, np.ones(z.shape, dtype=bool))
     made["dem_accuracy"] = Bundle({"error": error}, {**lattice, "metrics": judged})
     positions, assessed = trajectory_accuracy(poses, poses)
     made["accuracy"] = Bundle(positions, {"metrics": assessed, "frames": list(FRAMES)})

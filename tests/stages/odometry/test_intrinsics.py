@@ -74,17 +74,25 @@ def segment(
 
 
 def facts_of(
-    given: Camera, lens: Lens, turn: float = 0.05, yaw: float = 0.0, base: RigidTransform = T_RIGHT_LEFT, **known
+    given: Camera,
+    lens: Lens,
+    turn: float = 0.05,
+    yaw: float = 0.0,
+    base: RigidTransform = T_RIGHT_LEFT,
+    segments: int = 8,
+    changed: bool = False,
+    **known,
 ):
-    """Facts that eight segments lead to, of a camera that is given, and of a rig that is off by a yaw."""
+    """Facts that segments lead to, of a camera that is given, and of a rig that is off by a yaw; it may have been
+    ``changed`` before."""
     parts = []
-    for seed in range(8):
+    for seed in range(segments):
         tracks, state, cameras = segment(seed, given, lens, turn, yaw, base)
         end = adjust(tracks, state, PARAMS).state
         part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
         facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": part.yaw}
         parts.append(Bundle({}, {"intrinsics": facts}))
-    rig = Bundle({}, {"rig": cameras.rig.to_dict()})
+    rig = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": changed})
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
 
@@ -155,6 +163,19 @@ def test_a_yaw_below_half_a_pixel_passes():
     facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.2 / CAMERA.fx)
     assert facts["correction"] == [0.0] * (CORRECTED + 1)
     assert facts["yaw"][0] == pytest.approx(-0.2 / CAMERA.fx, abs=4.0 * facts["yaw"][1])
+
+
+@pytest.mark.parametrize("segments", [1, 2])
+def test_two_segments_that_agree_tell_a_yaw(segments):
+    facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.006, segments=segments)
+    assert facts["correction"][-1] == pytest.approx(-0.006 * (segments > 1), abs=0.001)
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_of_a_rig_that_was_repaired_no_yaw_is_known_before(changed):
+    """The right camera was knocked: a yaw below half a pixel, which passes with a calibration, is corrected."""
+    facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.3 / CAMERA.fx, changed=changed)
+    assert facts["correction"][-1] * CAMERA.fx == pytest.approx(-0.3 * changed, abs=0.1)
 
 
 def test_covariances_contain_the_errors_of_the_calibration():

@@ -22,7 +22,7 @@ from rille.stages.geometry.projection import perturbed
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
-from rille.stages.odometry.resection.resect import SegmentPoints, knocked, resect_segment
+from rille.stages.odometry.resection.resect import ResectInputs, SegmentPoints, knocked, resect_segment
 from rille.stages.odometry.resection.robust_pose import ResectParams, resect
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
@@ -494,9 +494,10 @@ def test_a_vehicle_ahead_and_few_that_pass_leave_the_motion_as_it_is(near, far, 
 @pytest.mark.parametrize(
     ("column", "row", "told"), [(3.0, 0.0, True), (-2.0, 0.0, True), (0.0, 1.5, True), (0.5, 0.2, False)]
 )
-@pytest.mark.parametrize("finer", [1.0, 2.0])
-def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, finer):
-    """The later pair measures disparities that all depart alike from those of the landmarks."""
+@pytest.mark.parametrize(("finer", "before"), [(1.0, 0.0), (2.0, 0.0), (1.0, 2.5)])
+def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, finer, before):
+    """The later pair measures disparities that all depart alike from those of the landmarks, more than the earlier one,
+    whose camera may have been turned ``before``."""
     rng = np.random.default_rng(31)
     step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.4]))
     right = Camera(*(finer * value for value in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)), 1200, 1000)
@@ -506,21 +507,29 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, fine
     points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
     given, found = segment_poses(points, landmarks, RigidTransform.identity(), [4, 7])
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rays = CAMERA.rays(np.stack([u.ravel(), v.ravel()], 1).astype(float)) @ step.rotation.T
-    depth = (8.0 - step.translation[2]) / rays[:, 2]
-    shape = (CAMERA.height, CAMERA.width)
-    disparity = {
-        "column_disparity": (finer * (u.ravel() + column - 0.3 * CAMERA.fx / depth) - u.ravel()).reshape(shape),
-        "row_disparity": finer * (v + row) - v,
-        "validity": np.full(shape, Validity.MATCHED, np.uint8),
-    }
-    jumped = knocked(given, found, Bundle(disparity, {}), rig)
+
+    def wall(T: RigidTransform, column: float, row: float) -> Bundle:
+        rays = CAMERA.rays(np.stack([u.ravel(), v.ravel()], 1).astype(float)) @ T.rotation.T
+        depth = ((8.0 - T.translation[2]) / rays[:, 2]).reshape(u.shape)
+        disparity = {
+            "column_disparity": finer * (u + column - 0.3 * CAMERA.fx / depth) - u,
+            "row_disparity": finer * (v + row) - v,
+            "validity": np.full(u.shape, Validity.MATCHED, np.uint8),
+        }
+        return Bundle(disparity, {})
+
+    same = Bundle({}, {"rig": rig.to_dict()})
+    pairs = wall(RigidTransform.identity(), before, 0.0), wall(step, before + column, row)
+    inputs = ResectInputs(Bundle({}, {}), Bundle({}, {}), same, *pairs, same)
+    jumped = knocked(given.tracks, found, inputs)
     assert (jumped is not None) == told
     if jumped is not None:
         line, jump = jumped
         np.testing.assert_allclose(jump, [column, row], atol=0.05)
         assert line.startswith("the rig moved at pair 7")
         assert f"{(column or row):+.1f} px in the" in line
+    found.poses[-1] = np.nan  # the pair at the end has no pose: nothing is told
+    assert knocked(given.tracks, found, inputs) is None
 
 
 def with_a_lorry(beside, before, farthest=60):

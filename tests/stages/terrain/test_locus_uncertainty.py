@@ -47,13 +47,15 @@ def std(
     return standard_deviation(elevation, OrthoPair(*seen), uniform(turned), uniform(moved), apart, uniform(0.5))
 
 
-def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, moved: float = 0.0) -> float:
+def expected(
+    *, rise: float = RISE, grey: float = GREY, area: float = AREA, apart: float = 0.0, moved: float = 0.0
+) -> float:
     """By hand: the chequerboard's median difference is its height, its local mean nearly nothing."""
     noise = 1.4826 * NOISE
     variance = (
         FLOOR_PX**2
-        + STEP_FACTOR * (SCALE * rise) ** 2
-        + REST_FACTOR * NOISE**2 / (25 * (CONTRAST**2 * AREA + MIN_GRADIENT_POWER))
+        + STEP_FACTOR * (SCALE * rise) ** 2 / min(area, 1.0)
+        + REST_FACTOR * NOISE**2 / (25 * (CONTRAST**2 * min(area, 1.0) + MIN_GRADIENT_POWER))
     )
     variance += (
         (SHADE_FACTOR * noise / grey) ** 2
@@ -66,6 +68,13 @@ def expected(*, rise: float = RISE, grey: float = GREY, apart: float = 0.0, move
 @pytest.mark.parametrize("term", [{}, {"apart": AWAY}, {"moved": SHIFT}, {"apart": AWAY, "moved": SHIFT}])
 def test_variances_add_up_as_by_hand(term: dict[str, float]) -> None:
     np.testing.assert_allclose(std(*ground(), **term)[20, 25], expected(**term), rtol=5e-3)
+
+
+@pytest.mark.parametrize("area", [0.1, 4.0])
+def test_a_step_counts_from_pixel_to_pixel_where_cells_are_finer(area: float) -> None:
+    elevation, seen = ground()
+    seen[4] = area
+    np.testing.assert_allclose(std(elevation, seen)[20, 25], expected(area=area), rtol=5e-3)
 
 
 def test_each_part_counts() -> None:
