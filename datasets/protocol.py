@@ -101,6 +101,7 @@ class Simulation:
     truth_dem : ``truth_dem(lattice, T_truth_world, T_truth_left of stops)``: ``scene``.
     T_vehicle_left : mounting of the left camera; the vehicle's frame is between its wheels on the ground, y ahead.
     pad : m; radius about the start whose ground is known.
+    ground : m, x_min, x_max, y_min, y_max of the ground in the world frame.
     overview : a coarse elevation model of the whole world in a frame of its own: ``scene``.
     """
 
@@ -113,6 +114,7 @@ class Simulation:
     truth_dem: Callable[[Mapping[str, Any], RigidTransform, Sequence_[RigidTransform]], Source]
     T_vehicle_left: RigidTransform
     pad: float
+    ground: tuple[float, float, float, float]
     overview: Source | None = None
 
     def to_dict(self) -> dict[str, Any]:

@@ -40,6 +40,7 @@ RUNS = {
 }
 ELSEWHERE = {
     *(
+        "calibration.repetition",
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",

@@ -59,6 +59,7 @@ NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], 
     (lambda f: "pinhole" in f or ("rightToLeft" in f and "left" in f), boofcv.boofcv),
     (opencv.is_message, opencv.message),
     (has(*opencv.SINGLE), opencv.single),
+    (opencv.projections_alone, opencv.projections),
 )
 """Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""
 

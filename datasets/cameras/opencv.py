@@ -52,19 +52,31 @@ def sides(f: Fields) -> list[tuple[str, str]]:
 def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Both cameras of OpenCV's stereo samples: M1 D1 M2 D2, R T with ``x_right = R x_left + T``.
 
-    R and T may stand in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files with
-    LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
+    R, T and P1, P2 may stand in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files
+    with LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
     """
     lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
     poses: tuple[RigidTransform | None, RigidTransform | None]
+    placed = f if any(key in f for key in (*ROTATIONS, *TRANSLATIONS)) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
     else:
-        T_right_left = _relative(f) or _beside(path)
+        T_right_left = _relative(placed)
         poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
-    return [_with_rectified(camera, f, projection) for camera, projection in zip(found, projections, strict=True)]
+    return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
+
+
+def projections_alone(f: Fields) -> bool:
+    """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before; that is another one."""
+    return "P1" in f and "P2" in f and not any(key in f for key in (*ROTATIONS, *TRANSLATIONS))
+
+
+def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of images that are rectified already."""
+    sides = [_projected(name, f, key, _size(f)) for name, key in (("left", "P1"), ("right", "P2"))]
+    return [side for side in sides if side is not None]
 
 
 def is_message(f: Fields) -> bool:
@@ -138,25 +150,30 @@ def _relative(f: Fields) -> RigidTransform | None:
     return f.transform(rotation or ROTATIONS[0], translation or TRANSLATIONS[0])
 
 
-def _beside(path: Path) -> RigidTransform | None:
-    """Relative pose of ``extrinsics.yml`` beside ``intrinsics.yml``."""
+def _beside(path: Path) -> Fields | None:
+    """Entries of ``extrinsics.yml`` beside ``intrinsics.yml``."""
     if "intrinsic" not in path.name:
         return None
     other = path.with_name(path.name.replace("intrinsic", "extrinsic"))
     if not other.is_file():
         return None
     text = read_text(other, "calibration")
-    return _relative(Fields(parse_nested(text, str(other)), str(other)))
+    return Fields(parse_nested(text, str(other)), str(other))
 
 
 def _with_rectified(raw: CalibratedCamera, f: Fields, projection: str) -> CalibratedCamera:
-    """With the camera of its rectified images, whose axes are those of the rectified left camera."""
-    P = f.matrix(projection, 3, 4) if projection in f else np.zeros((3, 4))
+    """With the camera of its rectified images, where the file has that."""
+    size = raw.lens.camera.width, raw.lens.camera.height
+    return replace(raw, rectified=_projected(raw.name, f, projection, size)) if projection in f else raw
+
+
+def _projected(name: str, f: Fields, projection: str, size: tuple[int, int]) -> CalibratedCamera | None:
+    """A camera of rectified images, whose axes are those of the rectified left camera; None where P is empty."""
+    P = f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
-        return raw
-    values = (P[0, 0], P[1, 1], P[0, 2], P[1, 2])
-    camera = f.camera(projection, values, (raw.lens.camera.width, raw.lens.camera.height))
-    return replace(raw, rectified=CalibratedCamera(raw.name, Lens(camera), _baseline(P)))
+        return None
+    camera = f.camera(projection, (P[0, 0], P[1, 1], P[0, 2], P[1, 2]), size)
+    return CalibratedCamera(name, Lens(camera), _baseline(P))
 
 
 def _baseline(P: Floats) -> RigidTransform:

@@ -281,6 +281,8 @@ def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -
         raise InputError("RIL-247", "images of a drive come about on the way", remedy=f"rille drive {name}")
 
     site = {"pad": [*START[:2], rover.pad] if rover.pad > 0 else None, "blank": rover.blank}
+    # The rover looks along the bed, so the world frame is the bed's, moved to the left camera.
+    x, y, _ = T_vehicle_left.translation + np.array([*START[:2], 0.0])
     overview = Source("rille.datasets.mockup.overview", rover, {"cell": rover.map_cell})
     return Sequence(
         name=name,
@@ -306,6 +308,7 @@ def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -
             truth_dem=sources.dem,
             T_vehicle_left=T_vehicle_left,
             pad=rover.pad,
+            ground=(-0.5 * p.bed_width - x, 0.5 * p.bed_width - x, -y, p.bed_length - y),
             overview=None if rover.map_cell is None else overview,
         ),
     )

@@ -174,7 +174,7 @@ class Drive:
         self.driven = self.products.drive = Driven()
         self.simulation: Simulation = sequence.simulation
         self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
-        self.goal: tuple[float, float] = config.drive.goal
+        self.goal: tuple[float, float] = config.drive.goal if d.frame == "map" else self._on_ground(*config.drive.goal)
         self.posed: list[int] = [0]
         self.true: dict[int, tuple[float, ...]] = {}
         self.rows: dict[int, int] = {}
@@ -269,7 +269,19 @@ class Drive:
         """The goal in the world frame, which is the local frame of the first pair."""
         T_world_map = RigidTransform.from_matrix(fixed.meta["T_global_local"]).inverse()
         x, y, _ = T_world_map.apply([*self.config.drive.goal, fixed.meta["T_global_local"][11]])
-        self.goal = float(x), float(y)
+        self.goal = self._on_ground(float(x), float(y))
+
+    def _on_ground(self, x: float, y: float) -> tuple[float, float]:
+        """A goal in the world frame, where there is ground."""
+        x_min, x_max, y_min, y_max = self.simulation.ground
+        if not (x_min <= x <= x_max and y_min <= y <= y_max):
+            raise ConfigError(
+                "RIL-714",
+                f"the goal lies at ({x:.3g}, {y:.3g}) m of the world, beside the ground",
+                remedy=f"give one within x {x_min:.3g}..{x_max:.3g} and y {y_min:.3g}..{y_max:.3g} m of the world "
+                "frame (drive.goal), or a larger bed (mockup.bed_width, mockup.bed_length)",
+            )
+        return x, y
 
     def _map(self, stop: Stop) -> None:
         """What is known of the world at a stop, and its hazards."""

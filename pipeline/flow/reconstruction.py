@@ -22,6 +22,7 @@
                                                                                             trajectory <---------+
     lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
+    repetition:   rig -> repetition (images and matches of pairs that contradict it)
     wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
@@ -316,10 +317,12 @@ def simultaneous(
         suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
         if suspects:
             asked = make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain)
-            p.contradictions.append(asked)
+            p.contradictions += [asked, make.repetition(f"repetition{which}", spread(suspects, SUSPECTS))]
             timed = yield from done(asked)
             contradicted = any("contradiction" in one.meta for one in (timed, *judged))
             if contradicted and 2 * len(suspects) > len(basic):
+                # A rig that images of two times show is none: a camera that moves in it did not.
+                p.rigs = {} if timed.meta["partners"] else p.rigs
                 return None, {}
             if wrong := [pair for pair, _ in timed.meta["partners"]]:
                 unfit += wrong

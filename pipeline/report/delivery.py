@@ -20,7 +20,7 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.words import spans
 from rille.stages.core.quantities import metres
-from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
+from rille.stages.geometry.pose_arrays import GROUND_PLANE, REFERENCE_PLANE
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
@@ -243,6 +243,18 @@ def moved(view: RunView) -> list[str]:
     return [
         f"{len(pairs)} of {len(shares)} pairs show something that moves by itself, pair {most} the most: "
         f"{shares[most]:.0%} of its image. The world's terrain is made without it; models of single pairs hold it."
+    ]
+
+
+def unmeasured_vertical(view: RunView) -> list[str]:
+    """State that hazards are judged against the plane of the ground, where nothing else gives the vertical."""
+    sources = {facts_of(view, level).get("source") for level in view.products.level.values()}
+    if sources != {GROUND_PLANE} or view.bundle(view.products.world_risk) is None:
+        return []
+    return [
+        "Nothing states the vertical, so the plane of the ground that is seen counts as level: a slope that all of it "
+        "has is neither in the elevations nor in inclinations, risk and path. world.pitch_deg, world.up, an attitude "
+        "or an IMU in a manifest gives the vertical."
     ]
 
 

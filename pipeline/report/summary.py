@@ -50,6 +50,7 @@ def collect(view: RunView) -> dict[str, Any]:
             *view.sequence.notes,
             *delivery.coverage(view),
             *delivery.moved(view),
+            *delivery.unmeasured_vertical(view),
             *given_numbers(view),
             *resting(view),
         ],
@@ -95,7 +96,8 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     lines = list(view.sequence.warnings)
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     early = [p.screening, *p.contradictions, p.keyframes, p.intrinsics, *p.crosschecks, p.crosscheck, p.agreement]
-    for handle in (*early, p.trajectory, p.accuracy, p.position_accuracy, p.overlap_audit):
+    truths = (p.accuracy, p.position_accuracy, *p.disparity_accuracy.values())
+    for handle in (*early, p.trajectory, *truths, p.overlap_audit):
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))

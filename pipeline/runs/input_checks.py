@@ -20,6 +20,7 @@ from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
+from rille.stages.hfvm.given import MAX_REPEATED_SHARE
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 Level = Literal["OK", "WARN", "FAIL"]
@@ -103,7 +104,8 @@ LIMITS = {
             "RIL-907",
             "borne out",
             least=0.1,
-            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), and of this sign?",
+            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
+            "rows in order (PFM has the lowest first)?",
         ),
         Fault("RIL-656", "matched", least=0.02, remedy="do both images show one scene, taken at one time, and sharp?"),
         InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
@@ -128,6 +130,14 @@ LIMITS = {
             "residual or row offset",  # px, half px
             most=1.0,
             remedy="the calibration is off; reconstruct repairs what the images tell, `rille calibrate` the rest",
+        ),
+    ),
+    "repetition": (
+        InputLimit(
+            "RIL-712",
+            "repeated",
+            most=MAX_REPEATED_SHARE,
+            remedy="matches may be off by a period: view along the rows, or from nearer",
         ),
     ),
     "simultaneous": (Fault("RIL-665", "contradictions", most=0, remedy="pair the images anew"),),
@@ -380,6 +390,12 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
         words = f"the right image is turned by {abs(turn):.0f} degrees against the left one; {words}"
     figures = {"adjusted, px": after, "residual or row offset": max(before, 2 * abs(offset))}
     return judge("epipolar", words, {"turned, degrees": abs(turn), **figures})
+
+
+def judge_repetition(share: float) -> Finding:
+    """Share of the matches that look as well elsewhere, as on rows of plants."""
+    text = f"{100 * share:.0f} % of the matches look as well elsewhere on their epipolar lines"
+    return judge("repetition", text, {"repeated": share})
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:

@@ -67,6 +67,15 @@ class SwapFacts(Facts):
     exchanged: NotRequired[float]
 
 
+class RepetitionFacts(Facts):
+    """Whether the scene repeats."""
+
+    repeated: float
+    """Share of the matches that look as well elsewhere on their epipolar lines."""
+    contradiction: NotRequired[str]
+    warnings: NotRequired[list[str]]
+
+
 class SynchronyFacts(Facts):
     """Right frames that are of the time of left ones."""
 

@@ -20,6 +20,10 @@ MAX_TOP_SHARE = 1 / 4
 """Share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits."""
 
 
+OUTLYING = (0.5, 99.5)
+"""Percentiles of an image's samples beyond which they do not count."""
+
+
 def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     """Levels for all images of a sequence by some of them; None where they use their range, or show nothing but noise.
 
@@ -28,7 +32,9 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     deep = [image for image in images if np.issubdtype(image.dtype, np.uint16) and _shows(image)]
     if not deep:
         return None
-    dark, bright = (int(f(np.percentile(image, q) for image in deep)) for f, q in ((min, 0.5), (max, 99.5)))
+    dark, bright = (
+        int(f(np.percentile(image, q) for image in deep)) for f, q in zip((min, max), OUTLYING, strict=True)
+    )
     span, top = max(bright - dark, 1), max(int(image.max()) for image in deep)
     if span > MAX_SPAN_SHARE * WHITE and top > MAX_TOP_SHARE * WHITE:
         return None
@@ -60,5 +66,7 @@ def swapped(image: AnyArray) -> bool:
 
 
 def _shows(image: AnyArray) -> bool:
+    # Of a thermal camera a few dead pixels deviate by more than all of the scene.
+    image = np.clip(image, *np.percentile(image, OUTLYING)).astype(np.float32)
     # Means of 4 x 4 pixels keep a quarter of the deviation of noise alone.
-    return bool(cv2.blur(image.astype(np.float32), (4, 4)).std() > 0.5 * image.std())
+    return bool(cv2.blur(image, (4, 4)).std() > 0.5 * image.std())

@@ -56,6 +56,42 @@ def test_opencv_stereo_as_opencv_writes_it(tmp_path, suffix):
     assert lenses == {"left": left.lens, "right": right.lens}
 
 
+P1 = np.array([[380.0, 0, 239.5, 0], [0, 380, 179.5, 0], [0, 0, 1, 0]])
+P2 = np.array([[380.0, 0, 239.5, -76.0], [0, 380, 179.5, 0], [0, 0, 1, 0]])
+
+
+def test_opencv_projections_alone_are_those_of_rectified_images(tmp_path):
+    storage = cv2.FileStorage(str(tmp_path / "rectification.yml"), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("R1", ROTATION), ("R2", ROTATION), ("P1", P1), ("P2", P2), ("Q", np.eye(4))):
+        storage.write(key, value)
+    storage.release()
+    left, right = read_cameras(tmp_path / "rectification.yml")
+    rig, lenses = rig_of(left, right, ((480, 360), (480, 360)))
+    assert (rig.left.fx, rig.left.cx, rig.left.cy) == (380, 239.5, 179.5)
+    np.testing.assert_allclose(rig.T_right_left.translation, [-0.2, 0, 0], atol=1e-12)
+    assert not lenses
+
+
+def test_opencv_projections_stand_in_extrinsics_beside_intrinsics(tmp_path):
+    for file, entries in (
+        (
+            "intrinsics.yml",
+            {f"{what}{n}": value for n in (1, 2) for what, value in (("M", P1[:, :3]), ("D", np.zeros(5)))},
+        ),
+        ("extrinsics.yml", {"R": ROTATION, "T": SHIFT.reshape(3, 1), "P1": P1, "P2": P2}),
+    ):
+        storage = cv2.FileStorage(str(tmp_path / file), cv2.FILE_STORAGE_WRITE)
+        for key, value in entries.items():
+            storage.write(key, value)
+        storage.release()
+    left, right = read_cameras(tmp_path / "intrinsics.yml")
+    np.testing.assert_allclose(right.T_camera_reference.translation, SHIFT, atol=1e-12)
+    rig, _ = rig_of(left.rectified, right.rectified, ((480, 360), (480, 360)))
+    np.testing.assert_allclose(rig.T_right_left.translation, [-0.2, 0, 0], atol=1e-12)
+    with raises("RIL-100"):  # of raw images it is no camera
+        read_cameras(tmp_path / "extrinsics.yml")
+
+
 MONO = """%YAML:1.0
 ---
 image_width: 640

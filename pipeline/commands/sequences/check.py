@@ -188,6 +188,8 @@ class Inspection:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
+        alike = yield self.make.repetition("repetition", [pair])
+        self.say(judge.judge_repetition(alike.meta["repeated"]))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""

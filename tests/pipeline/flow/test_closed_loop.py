@@ -228,6 +228,13 @@ def test_a_drive_needs_a_goal_and_a_cell(store: Path) -> None:
         Drive(Graph(), sequence, config.build({}))
 
 
+@pytest.mark.parametrize("goal", [(0.0, 100.0), (0.9, 1.0), (0.0, -0.4)])
+def test_a_goal_beside_the_ground_is_refused_before_anything_is_computed(goal: tuple[float, float]) -> None:
+    drive = config.build({"drive": {"goal": goal}, "locus": {"cell_size": 0.004}})
+    with raises("RIL-714", "y -0.35..1.65"):
+        Drive(Graph(), open_sequence("mockup-loop"), drive)
+
+
 @pytest.mark.parametrize("given", [{}, {"prior": (0.0, 0.35, 0.0)}])
 def test_a_goal_in_a_map_without_a_pose_or_a_map_is_refused_before_anything_is_computed(given: dict[str, Any]) -> None:
     drive = {"goal": (0.0, 1.0), "frame": "map", **given}

@@ -249,6 +249,7 @@ def test_where_most_pairs_contradict_their_rig_nothing_is_measured(late: bool) -
     found = ("synchrony", {"partners": [[k, k + 1] for k in (0, 3, 5)] if late else []} | (line if late else {}))
     graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=[("rig", rig), found])
     assert products.trajectory is None
+    assert bool(products.rigs) != late
     assert labels(graph, "resect") == labels(graph, "locus") == []
 
 

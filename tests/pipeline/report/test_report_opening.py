@@ -292,3 +292,12 @@ def test_of_the_pair_whose_map_lacks_most_it_is_told_what_brings_that_in(outside
     lines = delivery.coverage(run)
     assert len(lines) == told
     assert all("pair 4" in line and "--set locus.max_sigma=0.02" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("source", "risk", "told"), [("ground plane", {}, 1), ("pitch", {}, 0), ("ground plane", None, 0)]
+)
+def test_that_a_slope_of_all_ground_counts_as_level_is_told_where_nothing_gives_the_vertical(source, risk, told):
+    levels = {pair: SimpleNamespace(meta={"source": source}) for pair in (0, 4)}
+    run = SimpleNamespace(products=SimpleNamespace(level=levels, world_risk=risk), bundle=lambda handle: handle)
+    assert len(delivery.unmeasured_vertical(run)) == told

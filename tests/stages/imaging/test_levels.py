@@ -46,6 +46,15 @@ def test_noise_and_blank_images_are_not_blown_up():
     assert dropped == levels_of([scene(29_000, 29_400)])
 
 
+def test_dead_pixels_hide_no_scene():
+    """A thermal camera's counts, of which the scene takes a few hundred."""
+    image = scene(7400, 7800)
+    image[::20, ::20] = 0
+    levels = levels_of([image])
+    assert levels is not None
+    assert levels[1] == levels_of([scene(7400, 7800)])[1] == 64
+
+
 def test_one_scale_holds_for_dark_and_bright_images():
     dark, bright = scene(100, 900), scene(100, 3600, 4)
     levels = levels_of([dark, bright])
