@@ -11,8 +11,12 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-SHORTEST, LONGEST = 0.005, 1000.0
-"""Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
+SHORTEST, LONGEST = 0.05, 1000.0
+"""Shares of an image's side between which a focal length is one: the angle of view is 169 or 0.06 degrees, and of a
+fisheye, which has a longer one, at most a full circle."""
+
+CLEARLY = 4.0
+"""Times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was cut."""
 
 MAX_OFF_CENTRE = 0.1
 """Share of an image's width by which a principal point usually lies off the centre at most."""
@@ -110,8 +114,27 @@ def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Size
     raise InputError("RIL-974", text, remedy=remedy)
 
 
+def _check_axes(camera: CalibratedCamera, size: tuple[int, int]) -> None:
+    """Refuse a camera of which columns and rows are exchanged, in its size or in its principal point.
+
+    ``size`` is that of the images, which are as large as the camera's, or as those turned by a quarter.
+    """
+    c, centre = camera.lens.camera, np.array(size) / 2
+    off, exchanged = (float(np.abs(point - centre).max()) for point in ((c.cx, c.cy), (c.cy, c.cx)))
+    turned = camera.size not in (None, size)
+    place = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name}"
+    if turned and CLEARLY * off < exchanged:
+        text = f"{place} is the centre of {size[0]} x {size[1]} images, as they are, its size {size[1]} x {size[0]}"
+        raise InputError("RIL-127", text, remedy="exchange width and height in the calibration")
+    if not turned and CLEARLY * exchanged < off:
+        text = f"{place} would be the centre of {size[0]} x {size[1]} images if cx and cy were exchanged"
+        raise InputError("RIL-133", text, remedy="exchange them; or, if the images were turned, turn them back")
+
+
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     c = camera.lens.camera
+    if size is not None and camera.size in (None, size, size[::-1]):
+        _check_axes(camera, size)
     if camera.size is not None and size is not None and camera.size != size:
         (width, height), scale = camera.size, size[0] / camera.size[0]
         remedy = "give the images as they were calibrated, or the calibration of images of this size"

@@ -679,7 +679,7 @@ def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
+        ({"cameras": "[cameras]\nfx = 6.4\ncx = 31.5\ncy = 23.5\n"}, r"fx = 6\.4 px gives an angle of view of 157"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
             r"principal point \(315, 23\.5\) px is 442 % of the width off the centre .* cut or scaled",
@@ -705,7 +705,19 @@ def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_th
     assert opened(write_sequence(tmp_path, cameras="[cameras]\nfx = 60.0\ncx = 63.5\ncy = 23.5\n")).warnings
 
 
-@pytest.mark.parametrize("fx", [0.004, 0.1, 1e9])
+def test_columns_and_rows_that_are_exchanged_are_named_as_that(tmp_path):
+    stated = "[cameras]\nfx = 60.0\ncx = {}\ncy = {}\nwidth = {}\nheight = {}\n"
+    with raises("RIL-133", "the centre of 64 x 48 images if cx and cy were exchanged"):
+        opened(write_sequence(tmp_path, cameras=stated.format(23.5, 31.5, 64, 48)))
+    with raises("RIL-127", "exchange width and height"):
+        opened(write_sequence(tmp_path, cameras=stated.format(31.5, 23.5, 48, 64)))
+    with raises("RIL-131", "auto-orient"):
+        opened(write_sequence(tmp_path, cameras=stated.format(23.5, 31.5, 48, 64)))
+    # Off the centre by a crop, not by an exchange.
+    assert opened(write_sequence(tmp_path, cameras=stated.format(24.0, 28.5, 64, 48))).warnings
+
+
+@pytest.mark.parametrize("fx", [0.004, 3.0, 1e9])
 def test_focal_lengths_that_no_lens_has_are_refused_when_the_manifest_is_read(tmp_path, fx):
     with raises("RIL-987", "64 x 48"):
         opened(write_sequence(tmp_path, cameras=f"[cameras]\nfx = {fx!r}\ncx = 31.5\ncy = 23.5\n"))
