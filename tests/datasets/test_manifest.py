@@ -694,6 +694,17 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     assert len(warnings) <= 2
 
 
+def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 10.0\n[truth]\nfile = "p.tum"\n', frames=9)
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in (-0.5, 0.55, 1.6)])
+    with raises("RIL-804", "1.05 s apart, more than 0.5 s"):
+        opened(path)
+    # At the times of the images nothing has to be.
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 1.0\n[truth]\nfile = "p.tum"\n', frames=9)
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in range(9)])
+    assert all(opened(path).truth)
+
+
 def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_the_figures_are_said(tmp_path):
     of_twice_the_size = "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"
     with raises("RIL-974", "some 128 x 96 pixels, the images are 64 x 48", "cx and cy times 0.5"):
