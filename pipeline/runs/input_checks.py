@@ -114,7 +114,8 @@ LIMITS = {
             "RIL-659",
             "beyond",
             most=0.5,
-            remedy="left and right are swapped, the baseline has the wrong sign, or the scene repeats (bricks, tiles)",
+            remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
+            "baseline has the wrong sign, or the scene repeats (bricks, tiles)",
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
