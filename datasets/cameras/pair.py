@@ -114,32 +114,23 @@ def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Size
     raise InputError("RIL-974", text, remedy=remedy)
 
 
-def _check_axes(camera: CalibratedCamera, size: tuple[int, int]) -> None:
-    """Refuse a camera of which columns and rows are exchanged, in its size or in its principal point.
-
-    ``size`` is that of the images, which are as large as the camera's, or as those turned by a quarter.
-    """
-    c, centre = camera.lens.camera, np.array(size) / 2
-    off, exchanged = (float(np.abs(point - centre).max()) for point in ((c.cx, c.cy), (c.cy, c.cx)))
-    turned = camera.size not in (None, size)
-    place = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name}"
-    if turned and CLEARLY * off < exchanged:
-        text = f"{place} is the centre of {size[0]} x {size[1]} images, as they are, its size {size[1]} x {size[0]}"
-        raise InputError("RIL-127", text, remedy="exchange width and height in the calibration")
-    if not turned and CLEARLY * exchanged < off:
-        text = f"{place} would be the centre of {size[0]} x {size[1]} images if cx and cy were exchanged"
-        raise InputError("RIL-133", text, remedy="exchange them; or, if the images were turned, turn them back")
+def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
+    """Refuse a camera whose principal point is the centre of its images, of this size, if cx and cy are exchanged."""
+    c = camera.lens.camera
+    off, exchanged = (max(abs(x - width / 2), abs(y - height / 2)) for x, y in ((c.cx, c.cy), (c.cy, c.cx)))
+    if off > max(CLEARLY * exchanged, 0.5 * MAX_OFF_CENTRE * width):
+        text = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name} would be the centre of"
+        remedy = "exchange them; or, if the images were turned, turn them back"
+        raise InputError("RIL-133", f"{text} {width} x {height} images if cx and cy were exchanged", remedy=remedy)
 
 
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     c = camera.lens.camera
-    if size is not None and camera.size in (None, size, size[::-1]):
-        _check_axes(camera, size)
     if camera.size is not None and size is not None and camera.size != size:
         (width, height), scale = camera.size, size[0] / camera.size[0]
         remedy = "give the images as they were calibrated, or the calibration of images of this size"
         if camera.size == size[::-1]:
-            remedy += " (turned by their tag: magick mogrify -auto-orient FILES)"
+            remedy += " (turned by their tag: magick mogrify -auto-orient FILES; or its width and height are exchanged)"
         elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
             # The centre of the first pixel is 0: its corner stays where it is.
             cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
@@ -153,4 +144,5 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     width, height = camera.size or size or (0, 0)
     lens = replace(camera.lens, camera=replace(c, width=width, height=height))
     check_focal(lens.camera, camera.name)
+    _check_axes(camera, width, height)
     return lens

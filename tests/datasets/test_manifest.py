@@ -720,10 +720,8 @@ def test_columns_and_rows_that_are_exchanged_are_named_as_that(tmp_path):
     stated = "[cameras]\nfx = 60.0\ncx = {}\ncy = {}\nwidth = {}\nheight = {}\n"
     with raises("RIL-133", "the centre of 64 x 48 images if cx and cy were exchanged"):
         opened(write_sequence(tmp_path, cameras=stated.format(23.5, 31.5, 64, 48)))
-    with raises("RIL-127", "exchange width and height"):
+    with raises("RIL-131", "auto-orient", "width and height are exchanged"):
         opened(write_sequence(tmp_path, cameras=stated.format(31.5, 23.5, 48, 64)))
-    with raises("RIL-131", "auto-orient"):
-        opened(write_sequence(tmp_path, cameras=stated.format(23.5, 31.5, 48, 64)))
     # Off the centre by a crop, not by an exchange.
     assert opened(write_sequence(tmp_path, cameras=stated.format(24.0, 28.5, 64, 48))).warnings
 
