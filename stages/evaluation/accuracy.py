@@ -23,7 +23,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.clock import LateTruth, TruePositions, late_truth
+from rille.stages.evaluation.clock import TruePositions, late_truth
 from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.hand_eye import hand_eye, misplaced, without_it
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
@@ -187,13 +187,6 @@ def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
     return np.array([pose or [np.nan] * 12 for pose in poses], dtype=np.float64).reshape(-1, 3, 4)
 
 
-def _late(estimate: Floats, record: Mapping[str, Any]) -> LateTruth | None:
-    """Whether the clock of the truth is off (see :func:`accuracy_stage`)."""
-    truth = record["truth"]
-    track = TruePositions(np.array(truth["positions"]), np.array(truth["times"]), truth["max_gap"])
-    return late_truth(np.array(record["moments"]), estimate[:, :, 3], track)
-
-
 @stage(
     "accuracy",
     version=8,
@@ -229,7 +222,9 @@ def accuracy_stage(
         body = mount or RigidTransform.identity()
         warnings = better_reading(estimate[both], true[both], body, stated)
         off = None if warnings else hand_eye(estimate, true)
-        late = None if warnings or record is None else _late(estimate, record)
+        late = None
+        if record is not None and not warnings:
+            late = late_truth(np.array(record["moments"]), estimate[:, :, 3], TruePositions.of(record["truth"]))
         if off is not None:
             _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, **(sigmas or {}))
             left = float(without["ate_rmse"]["value"] or 0.0)

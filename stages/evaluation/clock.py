@@ -11,8 +11,9 @@ searched, or takes half of it, the offset is not determined, and that of the sta
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -52,6 +53,12 @@ class TruePositions:
     times: Floats | None = None
     max_gap: float = 0.5
     lever_arm: Floats | None = None
+
+    @staticmethod
+    def of(d: Mapping[str, Any]) -> TruePositions:
+        """From the JSON form of :class:`rille.datasets.protocol.Positions`."""
+        values: Mapping[str, Any] = {name: np.array(v) if isinstance(v, list | tuple) else v for name, v in d.items()}
+        return TruePositions(**values)
 
     def at(self, moments: Floats) -> Floats:
         """Positions (moment, 2 or 3) on the straight line between two rows; NaN in longer gaps and beyond the ends."""

@@ -166,8 +166,7 @@ def position_accuracy_stage(
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against positions without rotation, of a frame and a clock of their own."""
     poses = by_frame(world_poses(trajectory), trajectory.meta["frames"], frames)
-    numbers = {name: None if truth[name] is None else np.array(truth[name]) for name in ("times", "lever_arm")}
-    given = TruePositions(np.array(truth["positions"], dtype=np.float64), max_gap=truth["max_gap"], **numbers)
+    given = TruePositions.of(truth)
     at = None if moments is None else np.array(moments, dtype=np.float64)
     upright = trajectory.meta["verticals"][trajectory.meta["main"]] == MEASURED_VERTICAL
     compared = position_accuracy(poses, given, at, upright)
