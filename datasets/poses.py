@@ -31,7 +31,7 @@ import numpy as np
 
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.text import units
-from rille.datasets.text.reading import read_lines
+from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
 from rille.datasets.text.units import unitless
@@ -143,11 +143,13 @@ def _at_origin(values: Floats) -> Bools:
     Some programs write it where they have none.
     """
     origin = ~values.any(axis=1)
-    steps = np.linalg.norm(np.diff(values[~origin, :3], axis=0), axis=1)
-    before = np.maximum.accumulate(np.where(origin, 0, np.arange(len(values))))
+    measured = np.asarray(~origin & (np.abs(values) < GREATEST).all(axis=1))
+    places = np.where(measured[:, None], values[:, :3], 0.0)
+    steps = np.linalg.norm(np.diff(places[measured], axis=0), axis=1)
+    before = np.maximum.accumulate(np.where(measured, np.arange(len(values)), 0))
     # Who comes back to the origin does so by steps like the others.
     jump = 10.0 * float(np.mean(steps)) if len(steps) else np.inf
-    return np.asarray(origin & (np.linalg.norm(values[before, :3], axis=1) > jump))
+    return np.asarray(origin & (np.linalg.norm(places[before], axis=1) > jump))
 
 
 def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> tuple[RigidTransform, ...]:

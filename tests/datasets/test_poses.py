@@ -68,7 +68,12 @@ def test_moments_in_which_a_tracker_has_lost_its_target_are_left_out(tmp_path):
 
 def test_the_pose_at_the_origin_is_none_where_the_row_before_is_far_from_it(tmp_path):
     def lines(first, there):
-        rows = [*first, *(f"{k} {there + 0.1 * k:g} 0 0 0 0 0.6 0.8" for k in range(2, 8)), "8 0 0 0 0 0 0 1"]
+        rows = [
+            *first,
+            "1.5 nan nan nan nan nan nan nan",
+            *(f"{k} {there + 0.1 * k:g} 0 0 0 0 0.6 0.8" for k in range(2, 8)),
+            "8 0 0 0 0 0 0 1",
+        ]
         return "\n".join(rows) + "\n"
 
     at_rest = ["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"]
