@@ -31,12 +31,12 @@ import numpy as np
 
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.text import units
-from rille.datasets.text.reading import read_lines
+from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
 from rille.datasets.text.units import unitless
 from rille.datasets.text.warning import warning
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
@@ -88,7 +88,7 @@ class TimedPoses:
     Attributes
     ----------
     times : seconds, increasing; None where the file has none, and rows are frames.
-    poses : T_reference_body, metres, one a row; None of a row of NaN.
+    poses : T_reference_body, metres, one a row; None of a row of NaN, or of zeros.
     name : the file, for messages.
     warnings : on rows that were left out.
     images : names of the images, with or without folders, whose rows they are; empty where the file names none.
@@ -126,11 +126,30 @@ def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> T
     columns = _columns(table, format, meant)
     warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
-        # Trackers that have lost their target write zeros.
-        lost = ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1) if quaternion else False
-        table, warnings = table.measured(list(columns.values()), np.asarray(lost))
+        lost = np.zeros(len(table.rows), bool)
+        if quaternion:
+            # Trackers that have lost their target write zeros.
+            lost |= ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1)
+        if quaternion and columns.keys() >= set(POSITION):
+            lost |= _at_origin(table.values([columns[name] for name in (*POSITION, "qx", "qy", "qz")]))
+        table, warnings = table.measured(list(columns.values()), lost)
     times = times_of(table, columns["time"]) if "time" in columns else None
     return TimedPoses(times, _posed(table, columns, unit), table.name, warnings)
+
+
+def _at_origin(values: Floats) -> Bools:
+    """Rows (n,) of x, y, z, qx, qy, qz (n, 6) that are the pose at the origin, which lies far from the row before.
+
+    Some programs write it where they have none.
+    """
+    origin = ~values.any(axis=1)
+    measured = np.asarray(~origin & (np.abs(values) < GREATEST).all(axis=1))
+    places = np.where(measured[:, None], values[:, :3], 0.0)
+    steps = np.linalg.norm(np.diff(places[measured], axis=0), axis=1)
+    before = np.maximum.accumulate(np.where(measured, np.arange(len(values)), 0))
+    # Who comes back to the origin does so by steps like the others.
+    jump = 10.0 * float(np.mean(steps)) if len(steps) else np.inf
+    return np.asarray(origin & (np.linalg.norm(places[before], axis=1) > jump))
 
 
 def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> tuple[RigidTransform, ...]:
@@ -329,7 +348,7 @@ def _matrices(table: TextTable, unit: float) -> tuple[RigidTransform | None, ...
     values = table.numbers(range(table.columns), gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
     values[:, :, 3] *= unit
     return tuple(
-        None if np.isnan(m).any() else rounded_pose(m, f"{table.name}, line {line}")
+        None if np.isnan(m).any() or not m.any() else rounded_pose(m, f"{table.name}, line {line}")
         for m, line in zip(values, table.lines, strict=True)
     )
 

@@ -138,6 +138,7 @@ class Sequence:
     times : seconds, one a frame.
     truth : T_truth_left of each frame, in any world frame, metres; None where the truth has a gap.
     truth_positions : truth that is positions alone, where ``truth`` is None.
+    truth_record : positions of the camera by the file of ``truth``, at its own times; None: it has one row a frame.
     truth_source : what the truth is, in words.
     truth_sigma_m, truth_sigma_rad : standard deviations of the true positions, and rotations about each axis; 0: not
         stated.
@@ -176,6 +177,7 @@ class Sequence:
     times: tuple[float, ...] | None = None
     truth: tuple[RigidTransform | None, ...] | None = None
     truth_positions: Positions | None = None
+    truth_record: Positions | None = None
     truth_source: str = ""
     truth_sigma_m: float = 0.0
     truth_sigma_rad: float = 0.0

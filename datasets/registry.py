@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rille.datasets.bags import is_bag
 from rille.datasets.images.files import Digests
 from rille.datasets.images.kinds import hints
 from rille.datasets.images.masks import masked
@@ -26,6 +27,7 @@ from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
+from rille.datasets.text.reading import Search, is_broken
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError
 
@@ -128,7 +130,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     # os.path, for pathlib raises where a name is too long, or no name.
     if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
         kind = "file" if path.suffix else "sequence"
-        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=_suggestion(name_or_path))
+        gone = is_broken(path) and f"it is a link to {os.readlink(path)}, which is missing"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=gone or _suggestion(name_or_path))
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # What the user wrote down goes before what the folder looks like.
@@ -150,6 +153,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     )
     if beside.is_file():
         remedy = f"give its manifest, {beside}"
+    elif bags := [entry.path for entry in Search().entries(path) if is_bag(Path(entry.path))]:
+        remedy = f"give a bag in it, e.g. {bags[0]}"
     elif (path / "report.json").is_file():
         remedy = "it is a run, not a sequence: `rille view` shows it, and rille.open_run reads it"
     raise InputError("RIL-277", f"{name_or_path} has no layout that is recognised", remedy=remedy)

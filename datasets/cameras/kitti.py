@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.cameras.text import entries
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
@@ -51,7 +52,7 @@ def _nameless(text: str) -> dict[str, list[str]]:
 def kitti(text: str, path: Path) -> list[CalibratedCamera]:
     """All cameras of the file, by the labels of their projections, in order."""
     lines = (line.partition(":") for line in text.splitlines())
-    labelled = {label.strip(): numbers.split() for label, _, numbers in lines if numbers.strip()}
+    labelled = entries(((label.strip(), numbers.split()) for label, _, numbers in lines if numbers.strip()), str(path))
     fields = Fields(labelled or _nameless(text), str(path))
     labels = sorted(label for label in fields.values if PROJECTION.fullmatch(label))
     if any(label.endswith("_roi") for label in labels):  # of the part that the images show

@@ -14,7 +14,7 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
-from rille.datasets.cameras.text import assignments
+from rille.datasets.cameras.text import assignments, entries
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -42,7 +42,10 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). Several resolutions tell their sizes; a
     single one is taken for that of the images.
     """
-    parts = {name.upper(): {k.lower(): v for k, v in ENTRY.findall(body)} for name, body in SECTION.findall(text)}
+    parts = {
+        name.upper(): entries(((k.lower(), v) for k, v in ENTRY.findall(body)), f"{path} {name}")
+        for name, body in SECTION.findall(text)
+    }
     names = [name.removeprefix("LEFT_CAM_") for name in parts if name.startswith("LEFT_CAM_")]
     stereo = Fields(parts.get("STEREO", {}), str(path), "STEREO ")
     cameras = []
@@ -135,11 +138,9 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here it is in metres."""
-    values: dict[str, object] = {}
-    for key, value in assignments(text):
-        matrix = value.startswith("[")
-        values[key] = value.strip("[]").replace(";", " ").split() if matrix else value
-    f = Fields(values, str(path))
+    values = entries((line for line in assignments(text) if line[0]), str(path))
+    rows = {key: value.strip("[]").replace(";", " ").split() for key, value in values.items() if value.startswith("[")}
+    f = Fields(values | rows, str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

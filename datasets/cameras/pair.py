@@ -11,8 +11,12 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-SHORTEST, LONGEST = 0.005, 1000.0
-"""Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
+SHORTEST, LONGEST = 0.05, 1000.0
+"""Shares of an image's side between which a focal length is one: the angle of view is 169 or 0.06 degrees, and of a
+fisheye, which has a longer one, at most a full circle."""
+
+CLEARLY = 4.0
+"""Times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was cut."""
 
 MAX_OFF_CENTRE = 0.1
 """Share of an image's width by which a principal point usually lies off the centre at most."""
@@ -110,13 +114,23 @@ def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Size
     raise InputError("RIL-974", text, remedy=remedy)
 
 
+def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
+    """Refuse a camera whose principal point is the centre of its images, of this size, if cx and cy are exchanged."""
+    c = camera.lens.camera
+    off, exchanged = (max(abs(x - width / 2), abs(y - height / 2)) for x, y in ((c.cx, c.cy), (c.cy, c.cx)))
+    if off > max(CLEARLY * exchanged, 0.5 * MAX_OFF_CENTRE * width):
+        text = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name} would be the centre of"
+        remedy = "exchange them; or, if the images were turned, turn them back"
+        raise InputError("RIL-133", f"{text} {width} x {height} images if cx and cy were exchanged", remedy=remedy)
+
+
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     c = camera.lens.camera
     if camera.size is not None and size is not None and camera.size != size:
         (width, height), scale = camera.size, size[0] / camera.size[0]
         remedy = "give the images as they were calibrated, or the calibration of images of this size"
         if camera.size == size[::-1]:
-            remedy += " (turned by their tag: magick mogrify -auto-orient FILES)"
+            remedy += " (turned by their tag: magick mogrify -auto-orient FILES; or its width and height are exchanged)"
         elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
             # The centre of the first pixel is 0: its corner stays where it is.
             cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
@@ -130,4 +144,5 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     width, height = camera.size or size or (0, 0)
     lens = replace(camera.lens, camera=replace(c, width=width, height=height))
     check_focal(lens.camera, camera.name)
+    _check_axes(camera, width, height)
     return lens

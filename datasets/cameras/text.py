@@ -6,7 +6,7 @@ Values stay text, or None where the file gives none; :mod:`rille.datasets.camera
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 from xml.etree import ElementTree
 
@@ -27,16 +27,41 @@ END = re.compile(r"^---[ \t]*$", re.MULTILINE)
 STAMPED = re.compile(r"\A\s*header:[ \t]*\n([ \t]+.*\n)*")
 """What is another one in each message of a topic."""
 
+TWICE = "{} stands there twice, with two values"
+
 C_OR_PYTHON: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 class _Loader(C_OR_PYTHON):  # type: ignore[misc]
     """YAML whose values stay text, as in XML: no tag, date, merge key or number means anything to the parser."""
 
+    def construct_mapping(self, node: Any, deep: bool = False) -> Mapping[Any, Any]:
+        """Entries, of which none may contradict another one."""
+        found: Mapping[Any, Any] = super().construct_mapping(node, deep=True)
+        for key, value in node.value:
+            if self.construct_object(value, deep=True) != found[self.construct_object(key, deep=True)]:
+                raise yaml.constructor.ConstructorError(None, None, TWICE.format(key.value), key.start_mark)
+        return found
+
     def construct_scalar(self, node: Any) -> Any:
         """Text, or None where it says that there is nothing."""
         text = super().construct_scalar(node)
         return None if text in ("", "~", "null") else text
+
+
+def entries(pairs: Iterable[tuple[str, Any]], file: str) -> dict[str, Any]:
+    """Entries by key.
+
+    Raises
+    ------
+    InputError
+        A key has two values.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if found.setdefault(key, value) != value:
+            raise InputError("RIL-126", f"{file}: {TWICE.format(key)}", remedy="keep the one that was calibrated")
+    return found
 
 
 def assignments(text: str) -> list[tuple[str, str]]:
@@ -112,14 +137,15 @@ def parse_xml(text: str, file: str) -> Mapping[str, Any]:
         raise InputError("RIL-143", f"{file} cannot be parsed: {error}", remedy="correct the file") from error
     if root.tag != "opencv_storage":
         return {}
-    return {child.tag: _node(child, file) for child in root}
+    return entries(((child.tag, _node(child, file)) for child in root), file)
 
 
 def _node(node: ElementTree.Element, file: str, depth: int = 2) -> Any:
     if depth > DEEPEST:
         raise InputError("RIL-756", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
     if len(node):
-        values = {child.tag: _node(child, file, depth + 1) for child in node}
+        # Items of a list have all the same tag.
+        values = entries(((child.tag, _node(child, file, depth + 1)) for child in node if child.tag != "_"), file)
         if node.get("type_id") == "opencv-matrix" and isinstance(values.get("data"), str):
             values["data"] = values["data"].split()
         return values

@@ -16,7 +16,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from rille.datasets.cameras.text import assignments
+from rille.datasets.cameras.text import assignments, entries
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 
@@ -49,15 +49,10 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
 
 def _entries(text: str, file: str) -> tuple[Fields, str]:
     """Entries ``key = numbers``, and the name of the lens model, which stands alone on its line."""
-    values: dict[str, object] = {}
-    lens = ""
-    for key, value in assignments(text):
-        if key:
-            words = value.split()
-            values[key] = words[0] if len(words) == 1 else words
-        elif not HEADER.fullmatch(value) and not lens:
-            lens = value
-    return Fields(values, file), lens
+    lines = assignments(text)
+    values = entries(((key, value.split()) for key, value in lines if key), file)
+    lens = next((value for key, value in lines if not key and not HEADER.fullmatch(value)), "")
+    return Fields({key: words[0] if len(words) == 1 else words for key, words in values.items()}, file), lens
 
 
 def _lens(f: Fields, kind: str, camera: Camera) -> Lens:

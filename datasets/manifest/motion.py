@@ -197,6 +197,12 @@ class MotionReader:
             moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
+            if 2 * sum(pose is not None for pose in poses) < len(poses):
+                self.refuse_sparse(section, moved.times or (), table)
+            if table == "truth":
+                left = np.zeros(3) if section.T_body_left is None else np.array(section.T_body_left)[3::4]
+                track = tuple(tuple(pose.apply(left).tolist()) for pose in moved.poses if pose)
+                self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
         elif timed.images:
             poses = self.of_images(timed)
         elif (rows := self.one_a_pair(poses)) is not None:
@@ -261,13 +267,17 @@ class MotionReader:
             )
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
-        spacing = float(np.median(np.diff(times))) if times is not None and len(times) > 1 else 0.0
-        if spacing > section.max_gap:
-            text = f"{self.name}: truth.max_gap: {section.file} has positions {spacing:.4g} s apart, more than "
-            text += f"{section.max_gap:g} s: nothing would be compared"
-            remedy = "raise truth.max_gap, if straight lines between them are exact enough"
-            raise InputError("RIL-804", text, remedy=remedy)
+        self.refuse_sparse(section, times or (), "truth")
         return protocol.Positions(rows, times, section.max_gap, section.lever_arm)
+
+    def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
+        """Refuse rows of which most are more than ``max_gap``, s, apart, so that there is nothing between them."""
+        spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        if spacing > section.max_gap:
+            text = f"{self.name}: {table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
+            text += f"{section.max_gap:g} s: nothing would be compared"
+            remedy = f"raise {table}.max_gap, if straight lines between them are exact enough"
+            raise InputError("RIL-804", text, remedy=remedy)
 
     def positions(
         self, section: Truth | PositionFile, found: TimedPositions, table: str

@@ -24,7 +24,7 @@ LONGEST_BASELINE = 20.0
 MAX_OFF_CENTRE_OF_UNKNOWN_SIZE = 0.04
 """The same as ``MAX_OFF_CENTRE`` where a calibration states no size: then images that were cut show by nothing else."""
 
-USUAL_VIEW_DEG = (5.0, 175.0)
+USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
 
 STREET = {"locus.cell_size": 0.1}

@@ -44,7 +44,12 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
     if any(poses):
         known = {"truth": poses, "frames": list(frames)}
         mount = s.truth_mount and s.truth_mount.to_list()
-        own = {"mount": mount, "sigma_m": s.truth_sigma_m, "sigma_rad": s.truth_sigma_rad}
+        record = s.truth_record
+        own = {
+            "mount": mount,
+            "sigmas": {"sigma_m": s.truth_sigma_m, "sigma_rad": s.truth_sigma_rad},
+            "record": record and _positions(make, record, frames),
+        }
         p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, **own, **known)
         if p.crosscheck is not None:
             p.crosscheck_accuracy = make.node(accuracy_stage, "accuracy/crosscheck", trajectory=p.crosscheck, **known)

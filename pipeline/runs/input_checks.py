@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from rille.datasets.protocol import Positions, Rows
+from rille.datasets.text.count import count
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -57,7 +58,7 @@ LIMITS = {
     ),
     "times": (
         Fault("RIL-643", "steps back", most=0, remedy="correct the times"),
-        InputLimit("RIL-644", "gaps", most=0, remedy="frames may be missing; is the overlap kept there?"),
+        InputLimit("RIL-644", "gaps", most=0, remedy="are frames missing there, or was the clock set forward?"),
     ),
     "truth": (InputLimit("RIL-645", "without", most=0, remedy="frames without truth are left out of the accuracy"),),
     "attitude": (
@@ -116,7 +117,8 @@ LIMITS = {
             "RIL-659",
             "beyond",
             most=0.5,
-            remedy="left and right are swapped, the baseline has the wrong sign, or the scene repeats (bricks, tiles)",
+            remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
+            "baseline has the wrong sign, or the scene repeats (bricks, tiles)",
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
@@ -199,7 +201,7 @@ def judge_times(times: Sequence[float] | None) -> Finding:
     gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
-        words += f"; {gaps} gaps, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
+        words += f"; {count(gaps, 'gap')}, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
     return judge("times", words, {"gaps": gaps})
 
 

@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.clock import TruePositions, late_truth
 from rille.stages.evaluation.conventions import better_reading
 from rille.stages.evaluation.hand_eye import hand_eye, misplaced, without_it
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
@@ -187,7 +189,7 @@ def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
 
 @stage(
     "accuracy",
-    version=7,
+    version=8,
     outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
         Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
@@ -200,15 +202,19 @@ def accuracy_stage(
     frames: list[int],
     truth: Sequence[Sequence[float] | None],
     mount: RigidTransform | None = None,
-    sigma_m: float = 0.0,
-    sigma_rad: float = 0.0,
+    sigmas: Mapping[str, float] | None = None,
+    record: Mapping[str, Any] | None = None,
 ) -> Bundle[AccuracyFacts]:
-    """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES."""
+    """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES.
+
+    ``sigmas``: of the truth itself, ``sigma_m`` and ``sigma_rad``. ``record``: its positions (row, 3), m, at
+    ``times`` of its own, s, as for :mod:`rille.stages.evaluation.position_accuracy`.
+    """
     given, true = trajectory.meta["frames"], pose_rows(truth)
     estimate, claimed = rigid.by_frame(world_poses(trajectory), given, frames), None
     if "covariance" in trajectory.arrays:
         claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, frames)
-    arrays, figures = trajectory_accuracy(estimate, true, claimed, sigma_m, sigma_rad)
+    arrays, figures = trajectory_accuracy(estimate, true, claimed, **(sigmas or {}))
     facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
@@ -216,10 +222,20 @@ def accuracy_stage(
         body = mount or RigidTransform.identity()
         warnings = better_reading(estimate[both], true[both], body, stated)
         off = None if warnings else hand_eye(estimate, true)
+        late = None
+        if record is not None and not warnings:
+            late = late_truth(np.array(record["moments"]), estimate[:, :, 3], TruePositions.of(record["truth"]))
         if off is not None:
-            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, sigma_m, sigma_rad)
-            warnings = [misplaced(off, body, figures, without)]
-            figures |= without_it(off, without)
+            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, **(sigmas or {}))
+            left = float(without["ate_rmse"]["value"] or 0.0)
+            # A lever arm ahead and a clock look alike, but for turns.
+            if late is None or left <= late.error:
+                late, warnings = None, [misplaced(off, body, figures, without)]
+                figures |= without_it(off, without)
+        if late is not None:
+            as_given = f"as given {figures['ate_rmse']['value']:.2g} m"
+            words = f"with {late.offset:.3f} s added to its times {late.error:.2g} m RMS are left after the best fit"
+            warnings = [f"the truth's clock is off: {words}, {as_given}: add that to truth.time_offset"]
         if warnings:
             facts["warnings"] = warnings
     return Bundle(arrays, facts)

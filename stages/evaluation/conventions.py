@@ -1,10 +1,10 @@
 """Whether truth would fit the trajectory if its file were read by another convention; no estimate is changed by this.
 
 A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
-axis), by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24 that exchange axes
-or the one that fits best. Readings are compared by what the best rotation and translation of the world leaves of
-positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the trajectory. A drive
-that is straight or hardly turns is fitted by several readings alike: they are named together.
+axis), in reverse order, by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24
+that exchange axes or the one that fits best. Readings are compared by what the best rotation and translation of the
+world leaves of positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the
+trajectory. A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
 MIN_SHARE = 1e-6
 # Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
-# reading leaves at most.
-MIN_MISFIT, MAX_SHARE = 0.02, 0.4
+# reading leaves at most, and of the extent; and from where on no estimate errs so.
+MIN_MISFIT, MAX_SHARE, MAX_MISFIT, MUCH = 0.02, 0.4, 0.1, 0.3
 # Factor on the least misfit, and share of the extent beyond, up to which readings cannot be told apart; and the factor
 # up to which an estimate's own errors may favour one that changes more.
 ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
@@ -87,7 +87,7 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     as_read, file = _misfit(P, Q), compose(Q, inverse(mount))
     if as_read < MIN_MISFIT:
         return []
-    fits = []
+    fits = _fits(P, Q[::-1], mount, ["it runs backwards: reverse its rows, or the order of the images"])
     for order, direction, mirror in product(ORDERS, DIRECTIONS, MIRRORS):
         # A file that begins with the identity has its quaternions in the right order.
         if not (order and angle(file[0]) < MIN_TURN):
@@ -102,8 +102,12 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
             # M R M and M t of a mirror M = diag(signs).
             fits += _fits(P, compose(poses * np.outer(signs, [*signs, 1.0]), mount), mount, words)
     best = min(fit.misfit for fit in fits)
-    if best > MAX_SHARE * as_read:
-        return []
+    if best > min(MAX_SHARE * as_read, MAX_MISFIT):
+        text = (
+            f"the truth does not fit the trajectory: {as_read:.0%} of its extent are left, {best:.0%} at least by other"
+        )
+        doubt = "conventions: is it of this drive, and are its columns, and the order of the images, right?"
+        return [f"{text} {doubt}"] if as_read > MUCH else []
     # The simplest of those that fit: others may fit better by the estimate's own errors.
     most = min(MAX_SHARE * as_read, SIMPLE_FACTOR * best + ALIKE_SHARE)
     changes = min(fit.changes for fit in fits if fit.misfit <= most)

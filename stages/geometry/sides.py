@@ -43,13 +43,13 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
         raise DegenerateError(
             "RIL-781",
             f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, the sign of the baseline, and whether the scene repeats "
-            "along the rows (bricks, tiles)",
+            remedy="check left/right order, they seem swapped, the sign of the baseline, whether the images are "
+            "mirrored or upside down, and whether the scene repeats along the rows (bricks, tiles)",
         )
     if beyond > 0.5:
         raise DegenerateError(
             "RIL-375",
             f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="check that left and right are of one scene and one time, the angles between the cameras, and "
-            "whether the scene repeats along the rows (rows of plants, bricks, tiles)",
+            remedy="check that left and right are of one scene and one time, the angles between the cameras, that each "
+            "has its own principal point, and whether the scene repeats along the rows (rows of plants, bricks, tiles)",
         )

@@ -802,6 +802,32 @@ def test_decimal_commas_are_called_so(tmp_path, text):
         read_cameras(written(tmp_path, text))
 
 
+PROJECTION = "7e2 0 31.5 {} 0 7e2 23.5 0 0 0 1 0"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("T: [-0.5, 0, 0]\nM1: 3\n", "T: [-0.4, 0, 0]\n"),
+        (f"P0: {PROJECTION.format(0)}\nP1: {PROJECTION.format(-350)}\n", f"P1: {PROJECTION.format(-280)}\n"),
+        ("fu = 3\nfv = 3\n", "fu = 4\n"),
+        ("cam0=[3 0 1; 0 3 1; 0 0 1]\nbaseline=100\n", "baseline=120\n"),
+        ("[LEFT_CAM_HD]\nfx=3\n", "fx=4\n"),
+        ("<opencv_storage><M1>3</M1>", "<M1>4</M1></opencv_storage>"),
+        ('{"cameraData": 3', ', "cameraData": 4}'),
+    ],
+)
+def test_a_key_with_two_values_is_refused(tmp_path, first, second):
+    with raises("RIL-141" if first.startswith(("T:", "{")) else "RIL-126", "twice"):
+        read_cameras(written(tmp_path, first + second))
+
+
+def test_a_key_that_says_the_same_twice_and_lists_are_fine(tmp_path):
+    path = written(tmp_path, "<opencv_storage><a>1</a><a>1</a><b><_>1</_><_>2</_></b></opencv_storage>")
+    with raises("RIL-100"):
+        read_cameras(path)
+
+
 @pytest.mark.parametrize(
     "text", [PINHOLE, ORB, "P0: 707 0 601 0 0 707 183 0 0 0 1 0\nP1: 707 0 601 -380 0 707 183 0 0 0 1 0\n"]
 )

@@ -679,7 +679,7 @@ def test_images_whose_names_no_line_can_hold_are_refused(tmp_path, name):
 @pytest.mark.parametrize(
     ("parts", "line"),
     [
-        ({"cameras": "[cameras]\nfx = 1.2\ncx = 31.5\ncy = 23.5\n"}, r"fx = 1\.2 px gives an angle of view of 176"),
+        ({"cameras": "[cameras]\nfx = 6.4\ncx = 31.5\ncy = 23.5\n"}, r"fx = 6\.4 px gives an angle of view of 157"),
         (
             {"cameras": "[cameras]\nfx = 60.0\ncx = 315.0\ncy = 23.5\n"},
             r"principal point \(315, 23\.5\) px is 442 % of the width off the centre .* cut or scaled",
@@ -694,6 +694,17 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     assert len(warnings) <= 2
 
 
+def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path):
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 10.0\n[truth]\nfile = "p.tum"\n', frames=9)
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in (-0.5, 0.55, 1.6)])
+    with raises("RIL-804", "1.05 s apart, more than 0.5 s"):
+        opened(path)
+    # At the times of the images nothing has to be.
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 1.0\n[truth]\nfile = "p.tum"\n', frames=9)
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in range(9)])
+    assert all(opened(path).truth)
+
+
 def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_the_figures_are_said(tmp_path):
     of_twice_the_size = "[cameras]\nfx = 120.0\ncx = 63.5\ncy = 47.5\n"
     with raises("RIL-974", "some 128 x 96 pixels, the images are 64 x 48", "cx and cy times 0.5"):
@@ -705,7 +716,17 @@ def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_th
     assert opened(write_sequence(tmp_path, cameras="[cameras]\nfx = 60.0\ncx = 63.5\ncy = 23.5\n")).warnings
 
 
-@pytest.mark.parametrize("fx", [0.004, 0.1, 1e9])
+def test_columns_and_rows_that_are_exchanged_are_named_as_that(tmp_path):
+    stated = "[cameras]\nfx = 60.0\ncx = {}\ncy = {}\nwidth = {}\nheight = {}\n"
+    with raises("RIL-133", "the centre of 64 x 48 images if cx and cy were exchanged"):
+        opened(write_sequence(tmp_path, cameras=stated.format(23.5, 31.5, 64, 48)))
+    with raises("RIL-131", "auto-orient", "width and height are exchanged"):
+        opened(write_sequence(tmp_path, cameras=stated.format(31.5, 23.5, 48, 64)))
+    # Off the centre by a crop, not by an exchange.
+    assert opened(write_sequence(tmp_path, cameras=stated.format(24.0, 28.5, 64, 48))).warnings
+
+
+@pytest.mark.parametrize("fx", [0.004, 3.0, 1e9])
 def test_focal_lengths_that_no_lens_has_are_refused_when_the_manifest_is_read(tmp_path, fx):
     with raises("RIL-987", "64 x 48"):
         opened(write_sequence(tmp_path, cameras=f"[cameras]\nfx = {fx!r}\ncx = 31.5\ncy = 23.5\n"))

@@ -66,6 +66,24 @@ def test_moments_in_which_a_tracker_has_lost_its_target_are_left_out(tmp_path):
     assert "2 rows of 4" in found.warnings[0]
 
 
+def test_the_pose_at_the_origin_is_none_where_the_row_before_is_far_from_it(tmp_path):
+    def lines(first, there):
+        rows = [
+            *first,
+            "1.5 nan nan nan nan nan nan nan",
+            *(f"{k} {there + 0.1 * k:g} 0 0 0 0 0.6 0.8" for k in range(2, 8)),
+            "8 0 0 0 0 0 0 1",
+        ]
+        return "\n".join(rows) + "\n"
+
+    at_rest = ["0 0 0 0 0 0 0 1", "1 0 0 0 0 0 0 1"]
+    assert read(tmp_path, lines(at_rest, 5.0)).times == (0, 1, 2, 3, 4, 5, 6, 7)
+    # Who is near comes back.
+    assert read(tmp_path, lines(at_rest, -1.0)).times[-1] == 8
+    matrices = ["1 0 0 0 0 1 0 0 0 0 1 0", "0 " * 12, "1 0 0 3 0 1 0 0 0 0 1 0"]
+    assert [pose is None for pose in read(tmp_path, "\n".join(matrices)).poses] == [False, True, False]
+
+
 def test_names_in_a_bracket_that_commas_part_tell_the_order_of_a_quaternion(tmp_path):
     names = "# stamp, translation (t_x, t_y, t_z), rotation quaternion (q_x, q_y, q_z, q_w), scale\n"
     found = read(tmp_path, names + f"5,1,2,3,0,0,{H},{H},1\n")

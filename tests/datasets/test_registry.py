@@ -88,6 +88,14 @@ def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):
     (run / "report.json").touch()
     with raises("RIL-277", "rille.open_run reads it"):
         open_sequence(str(run))
+    bags = tmp_path / "bags"
+    (bags / "second").mkdir(parents=True)
+    (bags / "second" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    with raises("RIL-277", f"give a bag in it, e.g. {bags / 'second'}"):
+        open_sequence(str(bags))
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    with raises("RIL-276", f"a link to {tmp_path / 'gone'}, which is missing"):
+        open_sequence(str(tmp_path / "link"))
     with raises("RIL-276", "no file 'field.toml'"):
         open_sequence("field.toml")
     with raises("RIL-992", "field.rille.txt is no sequence"):

@@ -58,6 +58,7 @@ MISREAD = {
     "begin with w": lambda true: quaternion(true, [3, 0, 1, 2]),
     "end with w": lambda true: quaternion(true, [1, 2, 3, 0]),
     "invert each": inverted,
+    "runs backwards": lambda true: true[::-1],
     "transpose each R": lambda true: poses(inverted(true)[:, :, :3], true[:, :, 3]),
     "negate x, qy and qz": lambda true: mirrored(true, -1, 1, 1),
     "negate y, qx and qz": lambda true: mirrored(true, 1, -1, 1),
@@ -154,3 +155,13 @@ def test_a_jump_is_named_as_one_and_not_taken_for_a_unit():
     (line,) = better_reading(estimated(true, 1), wrong, RigidTransform.identity(), 0.01)
     assert "jumps by 1e+06 m behind 9 of its 24 poses" in line
     assert "unit" not in line
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_truth_that_no_convention_explains_is_said_not_to_fit(seed: int) -> None:
+    true = drive(seed, turn=3.0)
+    exchanged = poses(true[:, :, :3], true[:, [1, 0, 2], 3])  # columns of the positions alone
+    for truth in (exchanged, drive(seed + 1, turn=3.0)):
+        [line] = better_reading(estimated(true, seed), truth, RigidTransform.identity(), 0.01)
+        assert "does not fit" in line
+        assert "of this drive" in line

@@ -75,3 +75,40 @@ def test_figures_without_it_stand_beside_those_as_given() -> None:
     assert line.startswith("the truth's body is turned by 3.9 degrees and shifted by 0.05")
     stated = np.array(ast.literal_eval(line.split("truth.T_body_left = ")[1]))
     np.testing.assert_allclose(stated, rigid.compose(mount.matrix34, OFF), atol=0.02)
+
+
+def judged(estimate: Floats, true: Floats, record: Floats, offset: float) -> list[str]:
+    """Warnings on an estimate by poses, and by the positions (n, 3) of their record every 0.05 s, which is late."""
+    frames = list(range(len(true)))
+    trajectory = Bundle(
+        {"poses": estimate, "covariance": np.tile(1e-5 * np.eye(6), (len(true), 1, 1))}, {"frames": frames}
+    )
+    positions = {
+        "positions": record.tolist(),
+        "times": (0.05 * np.arange(len(record)) + offset).tolist(),
+        "max_gap": 0.2,
+    }
+    moments = [0.2 * frame for frame in frames]
+    given = {"frames": frames, "truth": true.reshape(-1, 12).tolist()}
+    return accuracy_stage(
+        NoParams(), trajectory, **given, record={"truth": positions, "moments": moments, "frames": frames}
+    ).meta.get("warnings", [])
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3, -0.25])
+@pytest.mark.parametrize("arm", [0.0, 0.4])
+def test_true_poses_of_a_late_clock_are_told_from_those_of_another_body(late: float, arm: float) -> None:
+    # Once around a bend, every 0.05 s, seen ahead of the camera by an arm or not; four rows a frame.
+    angles = 0.5 * np.sin(np.linspace(0.0, 9.0, 240))
+    R = Rotation.from_euler("z", angles[:, None]).as_matrix()
+    places = np.cumsum(R @ [0.06, 0.0, 0.0], axis=0) * (1.0 + 0.3 * np.sin(np.linspace(0.0, 5.0, 240)))[:, None]
+    record = np.concatenate([R, (places + R @ [arm, 0.0, 0.0])[:, :, None]], axis=2)
+    shifted = 20 - round(late / 0.05)
+    poses = np.concatenate([R, places[:, :, None]], axis=2)[20:220:4]
+    lines = judged(estimated(poses, 3), record[shifted : shifted + 200 : 4], record[:, :, 3], late - 1.0)
+    if late and not arm:
+        [line] = lines
+        assert f"with {-late:.1f}" in line or f"with {-late:.2f}" in line, line
+        assert "truth.time_offset" in line
+    elif late == 0.0:
+        assert not any("time_offset" in line for line in lines)
