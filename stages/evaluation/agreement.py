@@ -78,7 +78,7 @@ def compare(
         # Frames whose neighbour before is in the piece as well: a step over a gap is no motion between frames. Errors
         # of motions are in the frame before, and so free of the alignment.
         second = rows[1:][np.diff(rows) == 1]
-        E = rigid.relative_error(theirs, ours, second - 1, second)
+        E = rigid.relative_error(*(rigid.motion(poses, second - 1, second) for poses in (theirs, ours)))
         arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
         arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
