@@ -14,6 +14,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import tomli_w
 from pydantic import Field, create_model
 
@@ -174,8 +175,20 @@ def merge(into: dict[str, Any], layer: Mapping[str, Any], within: str = "") -> d
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value, f"{within}{key}.")
         else:
-            into[key] = dict(value) if isinstance(value, Mapping) else value
+            into[key] = merge({}, value) if isinstance(value, Mapping) else _plain(value)
     return into
+
+
+def _plain(value: Any) -> Any:
+    """A value as Python has it, where it is NumPy's, as those of sweeps are."""
+    if isinstance(value, np.ndarray):
+        value = list(value) if value.ndim else value[()]
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.floating):
+        # By its own digits: .002 of single precision is .002, not .0020000000949949026.
+        return float(str(value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def refuse_other_sections(given: Iterable[str], own: Sequence[str], command: str) -> None:
