@@ -32,13 +32,11 @@ from rille.pipeline.runs.session import memory_limit, settings, settings_of_run
 MAX_REASONS = 3
 """Different reasons of a stage that are printed; ``verbose`` prints each task's."""
 
-_SETTINGS, _WORK = Settings(), Work()
-
 
 def plan(
     seq: str = "mockup",
     *,
-    options: Work = _WORK,
+    options: Work = Work(),
     verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
 ) -> int:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
@@ -140,7 +138,7 @@ def _unknown(result: Result) -> Iterable[str]:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
 
 
-def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
+def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
     """Draw the stages of a run, the number of their tasks, and what each reads.
 
     What depends on results that are still to come is drawn as the last run had it; where there was none, the title says

@@ -38,10 +38,8 @@ MOTIONS, COMPARED_PAIRS = 12, 6
 """Motions that are measured, and pairs whose rows are compared with those of shifted right images: all over the
 sequence, so that a fault of its second half is found as well."""
 
-_SETTINGS = Settings()
 
-
-def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
+def check(seq: str, *more: str, options: Settings = Settings()) -> int:
     """Check sequences: open everything, match the first pair of each, and print one finding a line.
 
     Parameters
