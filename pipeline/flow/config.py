@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import tomli_w
@@ -34,20 +34,9 @@ So many points because models that are half as wrong show half as small an error
 """
 
 
-class Follows(NamedTuple):
-    """Values that suit another one: where ``section.key`` is ``value``, ``sets`` lies beneath what the user gives."""
-
-    section: str
-    key: str
-    value: Any
-    sets: dict[str, Any]
-
-
-ACCURATE_FOLLOWS = (Follows("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),)
-"""What follows of that preset where the user has overruled none of these values.
-
-With an accurate matcher the mean of what the disparity says and of what the images show is better than either.
-"""
+OF_BOTH: dict[str, Any] = {"locus": {"refined_share": 0.5}}
+"""What it sets besides where the matcher is accurate: the mean of what the disparity says and of what the images show
+is better than either."""
 
 NAVIGATION: dict[str, Any] = {
     "hfvm": {"preset": "fast"},
@@ -224,10 +213,8 @@ def build(*layers: Mapping[str, Any]) -> Params:
         merge(nested, layer)
     if _preset(nested, "terrain") == "accurate":
         nested = _beneath(nested, ACCURATE_TERRAIN)
-        for one in ACCURATE_FOLLOWS:
-            given = nested[one.section]
-            if isinstance(given, Mapping) and given[one.key] == one.value:
-                nested = _beneath(nested, one.sets)
+        if _preset(nested, "hfvm") == "accurate":
+            nested = _beneath(nested, OF_BOTH)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
     return validate(model(), nested, also=DATASET_SECTIONS)

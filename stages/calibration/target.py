@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.rigid import angle
-from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
 MODELS: Mapping[str, tuple[str, ...]] = {
     "radtan": ("k1", "k2", "p1", "p2", "k3"),
@@ -268,20 +268,20 @@ class Adjustment:
             by_lens, by_pose = j[:, 6 : 10 + d.size], j[:, :6]
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
-    def normal(self, x: Floats) -> _Normal:
-        """Normal equations."""
+    def normal(self, x: Floats) -> NormalEquations:
+        """Normal equations; the cost is in pixels squared, infinite where a corner has no image."""
         residual, jacobian = self.evaluate(x)
         # Of each corner, over the distance beyond which it loses weight.
         squares = (residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2
         weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
         weighted = (jacobian * weight[:, None]).T
         cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
-        return _Normal(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
+        return NormalEquations(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
 
-    def ahead(self, x: Floats, normal: _Normal, damping: float) -> Floats:
+    def ahead(self, x: Floats, normal: NormalEquations, damping: float) -> Floats:
         """The unknowns one damped step on."""
         damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
-        return x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0]
+        return np.asarray(x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0])
 
     def solve(self, x: Floats) -> Floats:
         """The unknowns of least cost, from ``x`` on.
@@ -354,14 +354,6 @@ class Adjustment:
         lens = ("fx", "fy", "cx", "cy", *MODELS[self.model])
         rig = [f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
-
-
-class _Normal(NamedTuple):
-    """Gauss-Newton matrix and gradient; sum of squares, pixels squared, infinite where a corner has no image."""
-
-    matrix: Floats
-    gradient: Floats
-    cost: float
 
 
 def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:

@@ -6,7 +6,7 @@ Sources: Marquardt (1963), doi:10.1137/0111030; Holland and Welsch (1977), doi:1
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,14 @@ class Equations(Protocol):
     def cost(self) -> float:
         """Half the weighted sum of squares, or what stands in its place."""
         ...
+
+
+class NormalEquations(NamedTuple):
+    """Gauss-Newton matrix (n, n), dense or sparse, and gradient (n,) at a state, and its cost."""
+
+    matrix: Any
+    gradient: Floats
+    cost: float
 
 
 X = TypeVar("X")

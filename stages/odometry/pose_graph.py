@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import cross_matrix, rotation_exp, rotation_log
-from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
 EXCESS = (1.0, 2.0, 5.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
@@ -123,14 +123,6 @@ class GraphState(NamedTuple):
         return np.concatenate([self.R, self.C[:, :, None]], axis=2)
 
 
-class GraphEquations(NamedTuple):
-    """Normal equations of a graph at a state."""
-
-    cost: float
-    matrix: scipy.sparse.csc_array
-    gradient: Floats
-
-
 @dataclass(frozen=True)
 class PoseGraph:
     """Factors between ``nodes`` nodes, of which the first is held, with a weight (m,) each.
@@ -181,7 +173,7 @@ class PoseGraph:
         rotation = rotation_log(back @ state.R[b] @ np.swapaxes(f.poses[:, :, :3], 1, 2))
         return np.concatenate([position, rotation], axis=1), way, lever
 
-    def normal(self, state: GraphState) -> GraphEquations:
+    def normal(self, state: GraphState) -> NormalEquations:
         """Normal equations of the weighted factors and of the sources' own information."""
         f, (off, way, lever) = self.factors, self._difference(state)
         root = self._scale[:, None, None] * f.root
@@ -205,9 +197,9 @@ class PoseGraph:
         gradient = J.T @ white.reshape(-1)
         gradient[sources] += self._prior * state.sources
         cost = 0.5 * float((white**2).sum() + (self._prior * state.sources**2).sum())
-        return GraphEquations(cost, scipy.sparse.csc_array(J.T @ J + scipy.sparse.diags_array(own)), gradient)
+        return NormalEquations(scipy.sparse.csc_array(J.T @ J + scipy.sparse.diags_array(own)), gradient, cost)
 
-    def ahead(self, state: GraphState, normal: GraphEquations, damping: float) -> GraphState:
+    def ahead(self, state: GraphState, normal: NormalEquations, damping: float) -> GraphState:
         """State after one step, the diagonal enlarged by ``damping`` times itself."""
         damped = normal.matrix + scipy.sparse.diags_array(damping * normal.matrix.diagonal())
         step = -_factorised(damped).solve(normal.gradient)
