@@ -102,11 +102,6 @@ TILE_CELLS = 512
 SEAMS = 24
 """Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
 
-SUSPECTS = 12
-"""Pairs of doubtful rows that are compared with right images of other times at once."""
-
-PLACES_FRAMES = 500
-"""Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
 
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
@@ -315,7 +310,8 @@ def simultaneous(
         judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
         suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
         if suspects:
-            asked = make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain)
+            # 12: pairs of doubtful rows that are compared with right images of other times at once.
+            asked = make.synchrony(f"synchrony{which}", spread(suspects, 12), chain)
             p.contradictions.append(asked)
             timed = yield from done(asked)
             contradicted = any("contradiction" in one.meta for one in (timed, *judged))
@@ -477,7 +473,8 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
         return []
     of, blocks = {pair.frame: pair for pair in pairs}, list[Handle[PlacesFacts]]()
     # Cut by frame numbers: where a pair is left out, the other blocks keep theirs.
-    for number, group in groupby(of, lambda frame: frame // PLACES_FRAMES):
+    # 500: frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks.
+    for number, group in groupby(of, lambda frame: frame // 500):
         here = list(group)
         features = [make.features(frame, "left") for frame in here]
         blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))

@@ -37,8 +37,6 @@ MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
 LEVEL = 1
 """Pyramid level of the displacements: half the resolution."""
-BASELINE_WHEELS = 1.6
-"""Distance driven between the two compared images [wheel diameters]; larger: less noise."""
 MAX_TURN_DEG = 6.0
 """Largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that the model had
 right."""
@@ -258,7 +256,8 @@ def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:
         for i in range(j - 1, -1, -1):
             if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > MAX_TURN_DEG:
                 break
-            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= BASELINE_WHEELS * wheel - 1e-9:
+            # 1.6: distance driven between the two compared images [wheel diameters]; larger: less noise.
+            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= 1.6 * wheel - 1e-9:
                 out.append((i, j))
                 break
     return out

@@ -23,10 +23,6 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.rigid import rms
 from rille.stages.numeric.robust import mad_sigma
 
-REST = 10.0
-"""Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
-determine no rotation."""
-
 MIN_SIGMAS, MIN_RATIO = 5.0, 2.0
 """Robust standard deviations above the median, and multiple of the median, below which no frame is flagged."""
 
@@ -100,7 +96,9 @@ def compare(
 
 def at_rest(poses: Floats, step_distance: Floats) -> bool:
     """Whether all positions lie within what the two trajectories differ by from step to step."""
-    return bool(step_distance.size and rigid.spread(poses) < REST * np.sqrt(np.mean(step_distance**2)))
+    # 10.0: ratio of the spread of positions to the error of a step below which a camera counts as at rest: its
+    # positions then determine no rotation.
+    return bool(step_distance.size and rigid.spread(poses) < 10.0 * np.sqrt(np.mean(step_distance**2)))
 
 
 def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:

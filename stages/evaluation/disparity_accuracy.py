@@ -15,12 +15,6 @@ from rille.stages.core.validity import matched
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
-THRESHOLDS_PX = (1, 2, 4)
-"""An error beyond these counts as bad: bad-1, bad-2, bad-4."""
-
-SIGMAS = (1, 2)
-"""Standard deviations within which errors are counted."""
-
 
 def filled(column: Floats32, match: Bools) -> Floats32:
     """Disparities (row, col), pixels right minus left, with every pixel that lacks a match filled along its row.
@@ -62,14 +56,16 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
             error.size / every.size if every.size else None, "1", f"share that is matched; {counts}"
         ),
     }
-    for limit in THRESHOLDS_PX:
+    # (1, 2, 4): an error beyond these counts as bad: bad-1, bad-2, bad-4.
+    for limit in (1, 2, 4):
         words = f"share off by more than {limit} px, "
         # Not "greater": where nothing is known the error is NaN, and bad.
         worse = float(np.mean(~(every <= limit))) if every.size else None
         figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
-    for count in SIGMAS:
+    # (1, 2): standard deviations within which errors are counted.
+    for count in (1, 2):
         share = float(np.mean(error <= count * claimed)) if error.size else None
         how = f"share within {count} standard deviation{'s' * (count > 1)} of the disparity, {of_matched}"
         figures[f"within_{count}_sigma"] = metric(share, "1", how)

@@ -30,8 +30,6 @@ constant transform of the truth."""
 MIN_TURN = math.radians(0.5)
 """Least turn where no shift shows: of a camera that hardly turns, a smaller one is as likely its principal point's."""
 
-PRIOR_SHARE = 0.003
-"""Weight of no turn over that of all motions: it draws a turn that they show by as much of it."""
 
 WITHOUT = {
     name: f"hand_eye_{name}"
@@ -75,7 +73,8 @@ def _turn(p: Floats, q: Floats, arm: Floats, lever: float) -> Floats:
     moved = np.concatenate([p[:, :, 3] + (p[:, :, :3] - np.eye(3)) @ arm, lever * rotation_log(p[:, :, :3])])
     said = np.concatenate([q[:, :, 3], lever * rotation_log(q[:, :, :3])])
     # What no motion shows, as the roll about a straight way, stays: the identity counts as much as a share of them.
-    return orthonormal(said.T @ moved + PRIOR_SHARE * np.linalg.norm(moved) ** 2 * np.eye(3))
+    # 0.003: weight of no turn over that of all motions: it draws a turn that they show by as much of it.
+    return orthonormal(said.T @ moved + 0.003 * np.linalg.norm(moved) ** 2 * np.eye(3))
 
 
 def without_it(off: Floats, figures: Mapping[str, Metric]) -> dict[str, Metric]:

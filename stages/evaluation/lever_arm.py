@@ -10,9 +10,6 @@ from rille.stages.geometry import rigid
 MIN_LEVER_FRAMES = 10
 """Frames by which a lever arm is fitted: with turn, shift and clock it has up to ten unknowns."""
 
-MIN_SWING = 0.1
-"""RMS way of the antenna about the camera over its lever arm, from which on turns show it: they are 6 degrees."""
-
 
 def fit_lever_arm(poses: Floats, truth: Floats, upright: bool, moments: Floats | None = None) -> tuple[Floats, int]:
     """The lever arm ``l`` (3,), m, by which ``P_i + R_i l`` fits the true positions best, and how much of it shows.
@@ -41,6 +38,8 @@ def fit_lever_arm(poses: Floats, truth: Floats, upright: bool, moments: Floats |
         swings = (R - R.mean(axis=0))[:, :width].reshape(-1, 3)
         off = centred[:, :width] - (P - P.mean(axis=0))[:, :width]
         u, s, vt = np.linalg.svd(swings - turns @ np.linalg.pinv(turns) @ swings, full_matrices=False)
-        shown = s > MIN_SWING * np.sqrt(len(P))
+        # 0.1: RMS way of the antenna about the camera over its lever arm, from which on turns show it: they are 6
+        # degrees.
+        shown = s > 0.1 * np.sqrt(len(P))
         arm = vt[shown].T @ ((u.T @ off.reshape(-1))[shown] / s[shown])
     return arm, int(shown.sum())

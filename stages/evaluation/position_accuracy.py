@@ -47,8 +47,6 @@ MIN_SHARE = 2 / 3
 EQUAL_ERROR = 2**0.5
 """Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
 
-MAX_RANGE_SHARE = 0.5
-"""Share of the searched range: where equally good offsets span more, the offset is not determined."""
 
 MAX_TRIALS = 20000
 """Most offsets that are tried before the best one is refined."""
@@ -135,7 +133,8 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
     ends = [worse[above - 1] if above > 0 else 0, worse[above] if above < len(worse) else -1]
     ended = [bool(EQUAL_ERROR * error(value) < errors[k] < np.inf) for k in ends]
     low, high = (float(tried[k]) for k in ends)
-    determined = all(ended) and high - low < MAX_RANGE_SHARE * np.ptp(tried[np.isfinite(errors)])
+    # 0.5: share of the searched range: where equally good offsets span more, the offset is not determined.
+    determined = all(ended) and high - low < 0.5 * np.ptp(tried[np.isfinite(errors)])
     return Offset(0.0 if not determined and low <= 0.0 <= high else value, low, high, bool(determined))
 
 

@@ -29,16 +29,12 @@ LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
-VERTICAL_SIGMA = math.radians(5.0)
-"""Of the world's vertical against that of the place: a plane of ground is a slope."""
 MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
 CAMERA_SHARE = 0.05
 """Error of the camera's own ways that no sensor is doubted for."""
 MIN_TURN = math.radians(1.0)
 """RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
-MIN_WAY_NOISES = 3.0
-"""Noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean nothing."""
 MIN_SIGMAS = 3.0
 """Standard deviations from which on a departure is one of the whole sensor."""
 
@@ -189,7 +185,9 @@ class RelativePrior:
             return 0.0, ""
         if self.drift:
             ways = moves[:, :, 3]
-            if np.sqrt((ways**2).sum(1).mean()) < MIN_WAY_NOISES * math.sqrt(2.0) * _noise(own):
+            # 3.0: noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean
+            # nothing.
+            if np.sqrt((ways**2).sum(1).mean()) < 3.0 * math.sqrt(2.0) * _noise(own):
                 return 0.0, ""
             # A turn that grows along the way leads it aside by half as much.
             allowed = self.drift + 0.5 * self.turn * float(np.linalg.norm(ways, axis=1).mean())
@@ -386,5 +384,6 @@ def pieces_with_fixes(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
 
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
-    root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
+    # 5 degrees: of the world's vertical against that of the place: a plane of ground is a slope.
+    root = np.diag([1e-3] * 3 + [1.0 / math.radians(5.0)] * 2 + [0.1])[None]
     return Factors.of(np.array([[-1, 0]]), pose[None], root)
