@@ -31,6 +31,7 @@ from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.rigid import posed
 from rille.stages.hazard.vehicle import Vehicle
 
 MODEL_RADIUS_WHEELS = 0.5
@@ -215,7 +216,7 @@ def obstacle_monitor_stage(
     lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
     surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, MODEL_RADIUS_WHEELS * wheel)
     poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
-    known = np.isfinite(poses).all(axis=(1, 2))
+    known = posed(poses)
     frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)

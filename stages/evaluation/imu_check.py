@@ -15,6 +15,7 @@ import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import level_rotation
+from rille.stages.geometry.rigid import posed
 
 # Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
 MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
@@ -39,7 +40,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     times : (frame,) s.
     axes : (3, 3) R_imu_left.
     """
-    both = np.isfinite(images).all(axis=(1, 2)) & np.isfinite(sensor).all(axis=(1, 2))
+    both = posed(images) & posed(sensor)
     if both.sum() <= 5:
         return []
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))

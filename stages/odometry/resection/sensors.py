@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
-from rille.stages.geometry.rigid import compose, motion, umeyama
+from rille.stages.geometry.rigid import compose, motion, posed, umeyama
 from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
@@ -174,7 +174,7 @@ class RelativePrior:
     def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
         sensed = self._at(own.rows, shift)
-        rows = np.flatnonzero(np.isfinite(sensed).all((1, 2)))
+        rows = np.flatnonzero(posed(sensed))
         # Over single frames noise would hide a turned mount.
         lag = max(len(rows) // 16, 1)
         a, b = rows[:-lag], rows[lag:]
@@ -201,7 +201,7 @@ class RelativePrior:
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
         """Factors from each node to the next that has a pose by the sensor."""
         poses = self._at(own.rows, late)
-        rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+        rows = np.flatnonzero(posed(poses))
         if self.drift and not np.diff(poses[rows, :, 3], axis=0).any():
             rows = rows[:0]  # errors are shares of ways, and it has gone none
         a, b = rows[:-1], rows[1:]
