@@ -58,7 +58,7 @@ def of_pair(make: Builder, pair: Pair) -> Steps:
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )
-    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None:
+    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None or not make.graph.asks_for("dem_accuracy"):
         return
     level, dem = (yield from done(pair.level)), (yield from done(pair.dem))
     exact = _truth_dem(make, Lattice.from_dict(dem.meta["lattice"]), pair.frame, level, (pair.frame,), "local")
