@@ -11,9 +11,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-SHORTEST, LONGEST = 0.005, 1000.0
-"""Shares of an image's side between which a focal length is one: the angle of view is 179 or 0.06 degrees."""
-
 MAX_OFF_CENTRE = 0.1
 """Share of an image's width by which a principal point usually lies off the centre at most."""
 
@@ -27,7 +24,8 @@ def check_focal(camera: Camera, name: str) -> None:
         It is one.
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
-        if not SHORTEST <= f / side <= LONGEST:
+        # Shares of the image's side: the angle of view is 179 or 0.06 degrees.
+        if not 0.005 <= f / side <= 1000.0:
             size = f"{camera.width} x {camera.height} pixels"
             text = f"camera {name}: {what} = {f:g} px cannot be that of images of {size}"
             raise InputError("RIL-987", text, remedy="give fx and fy in pixels")

@@ -38,14 +38,8 @@ LEAST_VIEWS = 3
 CORNER_SCALE = 0.5
 """Pixels; residuals beyond it lose weight in the first adjustment. Corners are found to 0.1 - 0.3 px."""
 
-BAD_RATIO, BAD_PX = 4.0, 0.5
-"""A view is bad if its RMS residual exceeds both four times the median of all views and half a pixel."""
-
 FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
 """Shares of an image's longer side that are tried as a fisheye's focal length: a diagonal of 220 to 25 degrees."""
-
-MAX_STEPS, SETTLED = 100, 1e-10
-"""Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
 MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
@@ -121,7 +115,8 @@ def calibrate_rig(
     x = replace(task, robust=True).solve(task.solve(task.start()) if model == "fisheye" else task.start())
     first = task.residuals(x)
     # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
-    limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
+    # A view is bad if its RMS residual exceeds both half a pixel and four times the median of all views.
+    limit = max(0.5, 4.0 * float(np.median([r.worst for r in first])))
     good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
     used = Adjustment(board, tuple(views[k] for k in good), sizes, model)
     _enough(used.views)
@@ -291,7 +286,7 @@ class Adjustment:
         DegenerateError
             The adjustment diverges.
         """
-        x = levenberg_marquardt(self, x, MAX_STEPS, SETTLED).state
+        x = levenberg_marquardt(self, x, 100, 1e-10).state
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
             raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x

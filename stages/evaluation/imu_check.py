@@ -46,8 +46,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
-    # A bias turns the sensor, too, and degrees would make it small.
-    # 0.15 rad/s: the largest bias of a gyroscope, which a unit of degrees would make small, too.
+    # A bias turns the sensor, too, by 0.15 rad/s at most; a unit of degrees would make it small.
     fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + 0.15 * np.median(np.diff(times[both]))
     readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]

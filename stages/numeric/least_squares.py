@@ -12,9 +12,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 
-FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
-"""Marquardt's factor at the start, and that from which on no step is expected to lower the cost any more."""
-
 
 class Equations(Protocol):
     """Normal equations at a state, and the cost there: infinite of a state that cannot be."""
@@ -60,10 +57,11 @@ class Minimum(NamedTuple, Generic[X]):
 
 def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, tolerance: float = 1e-9) -> Minimum[X]:
     """Minimum from ``state``; never worse than the start. Ends where a step lowers the cost by ``tolerance`` of it."""
-    damping, steps, finished = FIRST_DAMPING, 0, False
+    damping, steps, finished = 1e-4, 0, False
     now = problem.normal(state)
     first = now.cost
-    while steps < iterations and not finished and damping <= MAX_DAMPING:
+    # With more damping no step is expected to lower the cost any more.
+    while steps < iterations and not finished and damping <= 1e8:
         ahead = problem.ahead(state, now, damping)
         then = problem.normal(ahead)
         # Also of a refused step: at the minimum it changes the cost by rounding alone.

@@ -73,10 +73,6 @@ MIN_ERROR = 0.0175
 MIN_CHANGE = 0.004
 """The same of a camera that was corrected: which prior it had is no longer believed."""
 
-MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
-"""The same two limits of the yaw, as pixels of disparity; rows pass up to as many
-(:class:`rille.stages.calibration.parameter_selection.RelativeParams`)."""
-
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
 
@@ -323,7 +319,9 @@ def intrinsics_stage(
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
     shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_SEGMENTS]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] else MIN_YAW_PX) / focal
+    # The same two limits, as pixels of disparity; rows pass up to as many
+    # (:class:`rille.stages.calibration.parameter_selection.RelativeParams`).
+    least = (0.1 if made[-1] else 0.4) / focal
     # The yaw has the prior of the rig's other angles.
     yaw = common_errors(shown[:, :1], shown[:, 1], np.array([0.1 * params.prior]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))

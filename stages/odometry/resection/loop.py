@@ -27,8 +27,6 @@ from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_of
 from rille.stages.odometry.resection.robust_pose import Resection, ResectParams, resect
 from rille.stages.odometry.resection.trajectory import propagation
 
-MIN_INLIERS, MIN_INLIER_SHARE = 20, 0.4
-"""Landmarks that agree with one pose, and their share of those that match."""
 MIN_BLOCKS, BLOCKS = 5, 4
 """Parts of either image, of 4 x 4, in which landmarks agree."""
 MAX_DEPTH_RATIO = 1.1
@@ -103,7 +101,7 @@ def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> 
     except DegenerateError as error:
         raise NoLoopError(error.message.split(": ", 1)[-1]) from error
     count = int(posed.inlier.sum())
-    if count < max(MIN_INLIERS, MIN_INLIER_SHARE * len(known)):
+    if count < max(20, 0.4 * len(known)):
         raise NoLoopError(f"{count} of {len(known)} landmarks agree with one pose")
     return posed, known
 
