@@ -335,27 +335,24 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # Read outside of the try: an unreadable file is an error, while one with other contents has no cameras.
-    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run)
+    # An unreadable file is an error, while one with other contents has no cameras.
     try:
-        poses, place = np.loadtxt(lines, ndmin=2), _place(frames)
+        poses = np.loadtxt(read_lines(run / "trajectory.kitti", "trajectory"), ndmin=2)
+        place = georeference_in(frames_of(run / "frames.json"))
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
-def georeference_of(run: Path) -> Georeference | None:
-    """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
-    return _place(_frames(run)) if (run / "frames.json").exists() else None
+def frames_of(path: Path) -> dict[str, Any]:
+    """Content of a run's ``frames.json``; nothing where there is none."""
+    return dict(json.loads(read_text(path, "frames.json", TABLE))) if path.exists() else {}
 
 
-def _frames(run: Path) -> str:
-    return read_text(run / "frames.json", "frames.json", TABLE)
-
-
-def _place(frames: str) -> Georeference | None:
-    stated = json.loads(frames).get("georeference")
+def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
+    """Place of a run's world frame on Earth, as its :func:`frames_of` state it."""
+    stated = frames.get("georeference")
     return None if stated is None else Georeference.from_dict(stated)
 
 
