@@ -82,8 +82,8 @@ def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
     exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
     p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
     if p.world_path is not None:
-        p.truth_risk = make.hazards("risk/truth", [exact])
-        p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=p.truth_risk)
+        true_risk = make.hazards("risk/truth", [exact])
+        p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=true_risk)
 
 
 def _truth(make: Builder, frame: int) -> RigidTransform | None:

@@ -163,7 +163,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
-        p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
+        p.resections = [s.resection for s in segments]
         asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break

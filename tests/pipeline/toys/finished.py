@@ -224,7 +224,6 @@ def checks() -> dict[str, Bundle]:
 
 NAMES = {
     "images": "image",
-    "tracks": "track",
     "resections": "resect",
     "rigs": "rig",
     "orientations": "orientation",
