@@ -335,10 +335,10 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # An unreadable file is an error, while one with other contents has no cameras.
+    # Read outside of the try: an unreadable file is an error, while one with other contents has no cameras.
+    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run / "frames.json")
     try:
-        poses = np.loadtxt(read_lines(run / "trajectory.kitti", "trajectory"), ndmin=2)
-        place = georeference_in(frames_of(run / "frames.json"))
+        poses, place = np.loadtxt(lines, ndmin=2), georeference_in(json.loads(frames))
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -347,7 +347,11 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 def frames_of(path: Path) -> dict[str, Any]:
     """Content of a run's ``frames.json``; nothing where there is none."""
-    return dict(json.loads(read_text(path, "frames.json", TABLE))) if path.exists() else {}
+    return dict(json.loads(_frames(path))) if path.exists() else {}
+
+
+def _frames(path: Path) -> str:
+    return read_text(path, "frames.json", TABLE)
 
 
 def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
