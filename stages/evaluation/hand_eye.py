@@ -18,10 +18,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
 from rille.stages.facts.evaluation import Metric, metric
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_log
+from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
 
 MAX_ERROR_SHARE = 0.5
 """Share of the error of the motions from frame to frame that is left at most: errors of an estimate do not go with a
