@@ -63,7 +63,8 @@ class Factors:
         lever: Floats | None = None,
     ) -> Factors:
         """Factors that measure so many ``components`` and are doubted; 0: they are not doubted."""
-        bound = np.full(len(ends), bound_of(components) if components else np.inf)
+        # One in a hundred true factors has a longer whitened error.
+        bound = np.full(len(ends), scipy.special.chdtri(components, 0.01) if components else np.inf)
         shared = np.zeros((len(ends), 6, 0)) if shared is None else shared
         return Factors(ends, poses, root, shared, np.zeros((len(ends), 3)) if lever is None else lever, bound)
 
@@ -98,11 +99,6 @@ def root_of(covariance: Floats) -> Floats:
     sigma = np.sqrt(np.einsum("...ii->...i", covariance))
     unit = covariance / (sigma[..., :, None] * sigma[..., None, :])
     return np.asarray(np.linalg.inv(np.linalg.cholesky(unit)) / sigma[..., None, :])
-
-
-def bound_of(components: int) -> float:
-    """Squared length of the whitened error of so many components that one in a hundred true factors exceeds."""
-    return float(scipy.special.chdtri(components, 0.01))
 
 
 class GraphState(NamedTuple):
