@@ -51,8 +51,6 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
 
-MIN_AFTER = 3
-"""Images from which on a clock that was set is told from images that are written late."""
 
 Reckoned = tuple[RigidTransform | None, ...] | None
 Used = TypeVar("Used")
@@ -204,7 +202,8 @@ def _check_clock(found: Mapping[int, TakenImage], where: str) -> None:
     """
     stamps, late = np.array(list(found)), np.array([one.at - stamp for stamp, one in found.items()])
     for k in 1 + np.flatnonzero(np.diff(stamps) < 0):
-        if len(late) - k >= MIN_AFTER and late[k:].min() > late[:k].max():
+        # 3: images from which on a clock that was set is told from images that are written late.
+        if len(late) - k >= 3 and late[k:].min() > late[:k].max():
             text = f"{where}: header.stamp goes back by {(stamps[k - 1] - stamps[k]) / 1e9:.3g} s at image {k}"
             remedy = "its clock was set meanwhile: cut the bag there, and take each part as a sequence"
             raise InputError("RIL-958", text, remedy=remedy)

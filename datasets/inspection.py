@@ -23,7 +23,7 @@ from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
-from rille.datasets.poses import names_positions, of_images, read_positions
+from rille.datasets.poses import names_positions, of_images, positions_of
 from rille.datasets.text.reading import Search, is_file, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -347,7 +347,7 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
-    positions = read_positions(path, "csv", {}) if names_positions(table) else None
+    positions = positions_of(table, "csv", {}) if names_positions(table) else None
     # Without times they must be one a pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"

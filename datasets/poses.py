@@ -11,7 +11,7 @@ Forms of a file, one pose T_reference_body a row:
 * ``colmap``: ``images.txt`` of a text model, two lines an image: number, quaternion w x y z and translation from the
   world to the camera, the camera's number and the image's name; then its points, which are passed over.
 
-Truth may be positions alone (:func:`read_positions`): columns x, y and perhaps time and z, by name or as the manifest
+Truth may be positions alone (:func:`positions_of`): columns x, y and perhaps time and z, by name or as the manifest
 states.
 
 Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Coordinates and angles without a column
@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
     "euroc": ("time", *POSITION, *QUATERNION),
 }
 
+IMAGES = ("image", *QUATERNION, *POSITION, "camera", "name")
 IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 """Line of an image in a model of COLMAP, where the name is that of an image."""
 
@@ -101,8 +102,14 @@ class TimedPoses:
     images: tuple[str, ...] = ()
 
 
-def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> TimedPoses:
-    """Poses of a file (forms: see module).
+def read_motion(path: Path, format: str = "auto") -> TextTable:
+    """The table of a file of poses or positions, whatever its form (see module)."""
+    images = of_images(path) if format in ("auto", "colmap") else None
+    return read_table(path, "pose file") if images is None else images
+
+
+def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) -> TimedPoses:
+    """Poses of a table (forms: see module).
 
     Parameters
     ----------
@@ -115,11 +122,10 @@ def read_poses(path: Path, format: str = "auto", unit: float | None = None) -> T
     InputError
         The form is not recognised, or a row is not a time and a pose; the message names the line.
     """
-    if found := of_images(path, format):
-        table, images = found
-        back = TimedPoses(None, _posed(table, _meanings(table), unit), table.name, images=images)
-        return replace(back, poses=tuple(pose and pose.inverse() for pose in back.poses))
-    table = read_table(path, "pose file")
+    if table.header == IMAGES:
+        poses = _posed(table, _meanings(table), unit)
+        images = tuple(table.text(len(IMAGES) - 1))
+        return TimedPoses(None, tuple(pose.inverse() for pose in poses), table.name, images=images)
     meant = _meanings(table)
     if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
         return TimedPoses(None, _matrices(table, 1.0 if unit is None else unit), table.name)
@@ -161,18 +167,12 @@ def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> 
     return tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
 
 
-def of_images(path: Path, format: str = "auto") -> tuple[TextTable, tuple[str, ...]] | None:
-    """Poses from the world to cameras and the images' names of COLMAP's ``images.txt``; None of any other file."""
-    if format not in ("auto", "colmap"):
-        return None
+def of_images(path: Path) -> TextTable | None:
+    """Table of :data:`IMAGES`, poses from the world to cameras, of COLMAP's ``images.txt``; None of any other file."""
     lines = enumerate(read_lines(path, "pose file"), start=1)
     matches = ((k, IMAGE.fullmatch(line)) for k, line in lines if not line.lstrip().startswith("#"))
-    rows = [(k, *match.groups()) for k, match in matches if match and match[2].lower().endswith(SUFFIXES)]
-    if not rows:
-        return None
-    at, cells, images = zip(*rows, strict=True)
-    header = ("image", *QUATERNION, *POSITION, "camera")
-    return TextTable(str(path), header, tuple(tuple(text.split()) for text in cells), at, commas=False), images
+    rows = {k: (*m[1].split(), m[2]) for k, m in matches if m and m[2].lower().endswith(SUFFIXES)}
+    return TextTable(str(path), IMAGES, tuple(rows.values()), tuple(rows), commas=False) if rows else None
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ class TimedPositions:
     warnings: tuple[str, ...]
 
 
-def read_positions(
-    path: Path, format: str, columns: Mapping[Any, str | int], unit: float | None = None
+def positions_of(
+    table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None
 ) -> TimedPositions | None:
     """Positions of a table without rotations; None where the file holds poses.
 
@@ -194,16 +194,15 @@ def read_positions(
     ----------
     columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, where the table's names do not say it; with any
         of them the table is one of positions.
-    unit : as for :func:`read_poses`.
+    unit : as for :func:`poses_of`.
 
     Raises
     ------
     InputError
         A column in ``columns`` does not exist, x or y is missing, or a cell is no number.
     """
-    if format not in ("auto", "csv") or of_images(path, format):
+    if format not in ("auto", "csv") or table.header == IMAGES:
         return None
-    table = read_table(path, "file of positions" if columns else "pose file")
     stated = {meaning: _column(table, column) for meaning, column in columns.items()}
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated

@@ -24,7 +24,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field, replace
-from operator import index, methodcaller
+from operator import index
 from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -170,8 +170,10 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     >>> len(sequence), sequence[0].left.dims
     (9, ('row', 'col'))
     """
+    from rille.pipeline.flow import config
+
     words = assignments(settings)
-    opened = registry.open_sequence(place_of(path), settings)
+    opened = registry.open_sequence(place_of(path), config.merge({}, settings))
     said = (word for one in words for word in ("--set", one))
     return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
 
@@ -205,14 +207,14 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
     >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
     ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
     """
+    from rille.pipeline.flow import config
+
     words = []
     check_sections(settings)
-    for section, values in settings.items():
+    for section, values in config.merge({}, settings).items():
         for name, value in values.items():
-            # Sweeps are often NumPy's numbers.
-            plain = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
             try:
-                lines = tomli_w.dumps({"v": plain}).removeprefix("v = ").splitlines()
+                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
             except TypeError:
                 text = f"{section}.{name} = {value!r} is no value of TOML"
                 remedy = "give a number, a text, True or False, or a list of these; or leave it out"
@@ -588,8 +590,7 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
 
 
 def _carried(meta: Settings, settings: Settings) -> dict[str, str]:
-    # A setting may be a number or an array of NumPy.
-    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)}, default=methodcaller("tolist"))}
+    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)})}
 
 
 def _settings(data: Any) -> dict[str, Any]:

@@ -87,7 +87,9 @@ def recorded(names: list[str], folder: Path, *, outputs: bool = True) -> list[Ta
         where = {"runs": folder / "runs", "cache": folder / "cache"}
         opened = session._open(sequence, session.Options(given, executor="inline", **where), verb, print)
         if outputs:
-            opened.graph.last = lambda opened=opened: run_files.lay_out(opened.graph, opened.late(), {})
+            opened.graph.last = lambda opened=opened: run_files.lay_out(
+                opened.graph, session.late(opened.view, opened.drive), {}
+            )
         driver.run(opened.graph, opened.store, driver.RunOptions(executor="inline")).check()
         for node in opened.graph.nodes:
             kind = node.spec.args.get("step", node.spec.args.get("file"))

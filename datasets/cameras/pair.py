@@ -11,10 +11,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-SHORTEST, LONGEST = 0.05, 1000.0
-"""Shares of an image's side between which a focal length is one: the angle of view is 169 or 0.06 degrees, and of a
-fisheye, which has a longer one, at most a full circle."""
-
 CLEARLY = 4.0
 """Times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was cut."""
 
@@ -31,7 +27,8 @@ def check_focal(camera: Camera, name: str) -> None:
         It is one.
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
-        if not SHORTEST <= f / side <= LONGEST:
+        # The angle of view is 169 or 0.06 degrees; that of a fisheye, whose focal length is longer, a full circle at most.
+        if not 0.05 <= f / side <= 1000.0:
             size = f"{camera.width} x {camera.height} pixels"
             text = f"camera {name}: {what} = {f:g} px cannot be that of images of {size}"
             raise InputError("RIL-987", text, remedy="give fx and fy in pixels")

@@ -23,12 +23,13 @@ from rille.datasets.poses import (
     TimedPositions,
     coverage,
     interpolate,
-    read_poses,
-    read_positions,
+    poses_of,
+    positions_of,
+    read_motion,
     refuse_apart,
 )
 from rille.datasets.text.reading import read_lines
-from rille.datasets.text.tables import NUMBER, split
+from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
 from rille.datasets.text.units import unit_of
 from rille.stages.core.errors import IncompleteError, InputError
@@ -184,10 +185,11 @@ class MotionReader:
         remaining, whole = iter(rows), sum(not pair.absent for pair in self.pairs)
         return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
-    def poses(self, section: PoseFile | Attitude, table: str) -> Poses:
-        """T_reference_left of each pair from a file of poses of a body."""
+    def poses(self, section: PoseFile | Attitude, table: str, read: TextTable | None = None) -> Poses:
+        """T_reference_left of each pair from a file of poses of a body, which may have been ``read`` before."""
         path = self.root / section.file
-        timed = read_poses(path, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
+        rows = read or read_motion(path, section.format)
+        timed = poses_of(rows, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
         self.warn(timed.warnings)
         poses: Poses = timed.poses
         if timed.times is not None:
@@ -205,8 +207,8 @@ class MotionReader:
                 self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
         elif timed.images:
             poses = self.of_images(timed)
-        elif (rows := self.one_a_pair(poses)) is not None:
-            poses = tuple(rows)
+        elif (one_a_pair := self.one_a_pair(poses)) is not None:
+            poses = tuple(one_a_pair)
         else:
             text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
@@ -236,7 +238,8 @@ class MotionReader:
 
     def truth(self, section: Truth) -> None:
         """Poses of each pair, or positions alone with their own times."""
-        alone = read_positions(self.root / section.file, section.format, section.columns, section.unit)
+        rows = read_motion(self.root / section.file, section.format)
+        alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
@@ -246,7 +249,7 @@ class MotionReader:
             text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
         mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        self.state(truth=self.poses(section, "truth"), truth_mount=mount)
+        self.state(truth=self.poses(section, "truth", rows), truth_mount=mount)
         self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
     def odometry(self, section: Odometry) -> None:
@@ -309,7 +312,7 @@ class MotionReader:
         InputError
             The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
         """
-        found = read_positions(self.root / section.file, "auto", section.columns, section.unit)
+        found = positions_of(read_motion(self.root / section.file), "auto", section.columns, section.unit)
         if found is None:
             text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")

@@ -26,12 +26,8 @@ from rille.stages.geometry.geometry import Camera, RigidTransform
 
 MCEWEN_L = 0.6
 """McEwen's L near 70 degrees of phase angle, the usual one here."""
-EMISSION_COSINE = 0.31
-"""Cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon."""
 AMBIENT_LIGHT = 0.05
 """Stray light of the room, relative to the lamp on a surface that faces it."""
-LEVEL_GREY = 112.0
-"""Grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100."""
 
 
 def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:
@@ -194,8 +190,10 @@ def render_stage(
     rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(camera)])
     mu0 = math.sin(math.radians(scene.meta["scene"]["sun_elevation_deg"]))
     # Radiance of level ground of mean albedo, seen as the camera's axis sees it.
-    flat = 2.0 * MCEWEN_L * mu0 / (mu0 + EMISSION_COSINE) + (1.0 - MCEWEN_L) * mu0 + AMBIENT_LIGHT
-    gain = LEVEL_GREY / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
+    # 0.31: cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon.
+    flat = 2.0 * MCEWEN_L * mu0 / (mu0 + 0.31) + (1.0 - MCEWEN_L) * mu0 + AMBIENT_LIGHT
+    # 112.0: grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100.
+    gain = 112.0 / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
     # No two cameras are equally sensitive.
     gain *= 0.97 if camera == "right" else 1.0
     # Behind the bed the room is dark.

@@ -16,7 +16,7 @@ Order of creation is priority: what is created first runs first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Generic, NamedTuple, cast
@@ -227,18 +227,18 @@ class Graph:
         inputs = {name: args.pop(name) for name in stage.ports() if name in args}
         return self.node(stage, label, params, args, inputs=inputs)
 
-    def flow(self, steps: Generator[Wait, Any, None], lays: Collection[str] | None = None) -> None:
+    def asks_for(self, stage: str) -> bool:
+        """Whether tasks of a stage are wanted for themselves."""
+        return self.cut is None or stage in self.cut.stages
+
+    def flow(self, steps: Generator[Wait, Any, None]) -> None:
         """Run a generator on the client until it waits, and again when what it waits for is there.
 
         It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. Where
         one will never be, ``MissingError`` is raised in it. :class:`Complete` it yields without waiting.
-
-        ``lays`` are the stages of the tasks that follow what it waits for (None: of any stage): where none of them is
-        wanted, it ends at its first wait.
         """
         self.unfinished += 1
-        idle = self.cut is not None and lays is not None and self.cut.stages.isdisjoint(lays)
-        self._go_on(steps, lambda: next(steps), idle=idle)
+        self._go_on(steps, lambda: next(steps))
 
     def _wait(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> Awaited | None:
         """What a flow waits for next; None at its end, or where nothing that follows is wanted."""
@@ -253,7 +253,7 @@ class Graph:
             return None
         return wanted
 
-    def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait], *, idle: bool = False) -> None:
+    def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> None:
         try:
             wanted = self._wait(steps, step)
         except MissingError as error:
@@ -261,7 +261,7 @@ class Graph:
             # The flow never goes on; the end of the run names the tasks that it waited for.
             self.expansions.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
-        if wanted is None or idle:
+        if wanted is None:
             self.unfinished -= 1
             return
         one, maybe = isinstance(wanted, Handle), isinstance(wanted, Maybe)

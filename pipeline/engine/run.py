@@ -49,10 +49,6 @@ from rille.stages.core.errors import DegenerateError, RilleError
 MISSING = ("failed", "skipped", "planned")
 """Statuses of an input after which a task is not begun."""
 
-ROOM = 2000
-"""Tasks that the workers have at a time, also those that wait for others: so many that no worker waits for this
-process, and so few that dask's scheduler stays small."""
-
 
 class WorkerDiedError(RilleError):
     """A task took several worker processes along: out of memory, or a crash in native code."""
@@ -138,10 +134,7 @@ class RunOptions:
     kept: list[Workers] | None = None
 
 
-_DEFAULTS = RunOptions()
-
-
-def run(graph: Graph, store: Store, options: RunOptions = _DEFAULTS) -> Result:
+def run(graph: Graph, store: Store, options: RunOptions = RunOptions()) -> Result:
     """Bring every node of a graph to an artifact in ``store``; its handles are filled in, flows may add nodes.
 
     Raises
@@ -262,7 +255,9 @@ class _Run:
 
     def _take(self) -> bool:
         """Take up the next node; whether there was one, and room for it."""
-        if self.stopped or len(self.in_flight) >= ROOM:
+        # 2000: tasks that the workers have at a time, also those that wait for others: so many that no worker waits for
+        # this process, and so few that dask's scheduler stays small.
+        if self.stopped or len(self.in_flight) >= 2000:
             return False
         if self.suspects or not self.alone.isdisjoint(self.in_flight):
             if self.in_flight:

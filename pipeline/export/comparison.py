@@ -14,6 +14,7 @@ from rille.pipeline.export.view import RunView
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.agreement import carried
+from rille.stages.geometry.rigid import posed
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class CrosscheckComparison:
 def compare(view: RunView, agreement: Bundle) -> CrosscheckComparison:
     """Frame by frame against the crosscheck, of its agreement with the trajectory."""
     poses = by_frame(view, agreement, "poses")
-    registered = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    registered = posed(poses)
     trajectory = view.bundle(view.products.trajectory)
     if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
         piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)

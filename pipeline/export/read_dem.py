@@ -31,9 +31,6 @@ from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.core.errors import InputError
 from rille.stages.terrain.relief.grid import Grid
 
-MAX_PACKED_BYTES = 4_000_000
-"""Of a chunk of a zarr group, which has 512 x 512 values: zlib makes a thousand bytes of one at most, blosc 255."""
-
 MAX_CELLS = 500_000_000
 """Most cells of an elevation model, which is read whole."""
 
@@ -44,8 +41,6 @@ NO_PLACE = "give a raster that says itself where its cells are"
 TIFF = (b"II", b"MM")
 """How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
 
-OWN_TAGS = ("FRAME", "ERROR")
-"""Tags of the rasters that Rille writes: of a run, and of a comparison."""
 
 METRE = ("m", "metre", "metres", "meter", "meters")
 
@@ -198,7 +193,8 @@ def read_raster(path: Path, holds: str = "elevation") -> DemFile:
         _check_cells(path, file.shape)
         # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
         tags, coloured = file.tags(), "red" in {band.name for band in file.colorinterp}
-        if coloured or (file.descriptions[0] != holds and not tags.keys().isdisjoint(OWN_TAGS)):
+        # Tags of the rasters that Rille writes: of a run, and of a comparison.
+        if coloured or (file.descriptions[0] != holds and not tags.keys().isdisjoint(("FRAME", "ERROR"))):
             text = f"{path} has {'colours' if coloured else file.descriptions[0]}, no {holds}"
             remedy = "give an elevation model, of a run dem.tif; rille localize takes images by --ortho"
             raise InputError("RIL-636", text, remedy=remedy)
@@ -340,26 +336,27 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
     # Read outside of the try: an unreadable file is an error, while one with other contents has no cameras.
-    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run)
+    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run / "frames.json")
     try:
-        poses, place = np.loadtxt(lines, ndmin=2), _place(frames)
+        poses, place = np.loadtxt(lines, ndmin=2), georeference_in(json.loads(frames))
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
         return np.asarray((centres if place is None else place.apply(centres))[:, :2], np.float64)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return None
 
 
-def georeference_of(run: Path) -> Georeference | None:
-    """Place of a run's world frame on Earth, as its ``frames.json`` states it."""
-    return _place(_frames(run)) if (run / "frames.json").exists() else None
+def frames_of(path: Path) -> dict[str, Any]:
+    """Content of a run's ``frames.json``; nothing where there is none."""
+    return dict(json.loads(_frames(path))) if path.exists() else {}
 
 
-def _frames(run: Path) -> str:
-    return read_text(run / "frames.json", "frames.json", TABLE)
+def _frames(path: Path) -> str:
+    return read_text(path, "frames.json", TABLE)
 
 
-def _place(frames: str) -> Georeference | None:
-    stated = json.loads(frames).get("georeference")
+def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
+    """Place of a run's world frame on Earth, as its :func:`frames_of` state it."""
+    stated = frames.get("georeference")
     return None if stated is None else Georeference.from_dict(stated)
 
 
@@ -399,6 +396,7 @@ def check_group(path: Path) -> None:
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)
         packed = max((file.stat().st_size for file in (path / name).iterdir()), default=0)
         codecs = {getattr(codec, "codec_id", "") for codec in (*array.filters, *array.compressors)}
-        if array.metadata.zarr_format != 2 or codecs - {"zlib", "blosc"} or packed > MAX_PACKED_BYTES:
+        # 4_000_000 bytes of a chunk, which has 512 x 512 values: zlib makes a thousand bytes of one at most, blosc 255.
+        if array.metadata.zarr_format != 2 or codecs - {"zlib", "blosc"} or packed > 4_000_000:
             text = f"{path}: {name} is packed as Rille packs nothing, and may unpack to any size"
             raise InputError("RIL-997", text, remedy=OURS)

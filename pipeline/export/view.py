@@ -41,42 +41,54 @@ class TaskRow:
     cause: str = ""
 
 
-@dataclass(frozen=True)
-class RunView:
+@dataclass(frozen=True, kw_only=True)
+class Settled:
+    """Input of a run.
+
+    Attributes
+    ----------
+    sequence : what is reconstructed (:class:`rille.datasets.protocol.Sequence`).
+    frames : chosen frame numbers, in order.
+    config : validated configuration with all defaults, one section a stage, and ``vehicle``.
+    vehicle_source : who stated the vehicle's limits, in words.
+    given : dotted keys of the configuration that the user has set.
+    """
+
+    sequence: Sequence
+    frames: tuple[int, ...]
+    config: Any
+    vehicle_source: str = ""
+    given: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunView(Settled):
     """Everything that the report reads.
 
     Attributes
     ----------
     run_id : name of the run's folder.
-    sequence : what was reconstructed (:class:`rille.datasets.protocol.Sequence`).
-    frames : chosen frame numbers, in order.
     products : handles of what the run was to deliver; those of failed tasks lead to no bundle.
     tasks : every task of the plan.
-    config : validated configuration with all defaults, one section a stage, and ``vehicle``.
     bundle : the artifact of a handle, None where there is none (also for None); only what makes outputs needs it.
     config_toml : the configuration, as it was written to ``config.toml``.
     seconds : wall-clock time of the run so far.
     versions : distribution or program to version.
     command : the command line that repeats this run.
-    vehicle_source : who stated the vehicle's limits, in words.
     started : when, in words (ISO 8601, UTC).
     part : the options that chose a part of the run; empty: all of it.
     until, only : of a part: the stages whose tasks, or the files, that it is to make.
     left_out : of a part: the known tasks that were not wanted, by stage.
     """
 
-    run_id: str
-    sequence: Sequence
-    frames: tuple[int, ...]
     products: Products
-    tasks: tuple[TaskRow, ...]
-    config: Any
+    run_id: str = ""
+    tasks: tuple[TaskRow, ...] = ()
     bundle: Callable[[Any], Bundle | None] = lambda _: None
     config_toml: str = ""
     seconds: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
     command: str = ""
-    vehicle_source: str = ""
     started: str = ""
     part: str = ""
     until: tuple[str, ...] = ()

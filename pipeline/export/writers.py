@@ -24,6 +24,7 @@ from rille.stages.core.errors import ConfigError
 from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
+from rille.stages.geometry.rigid import posed
 
 FRAME = (
     "right-handed, metres: origin at the first left camera's centre, z up, y the horizontal projection of its "
@@ -211,11 +212,11 @@ def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence
     """
     from scipy.spatial.transform import Rotation
 
-    posed = np.isfinite(poses).all(axis=(1, 2))
+    there = posed(poses)
     # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
-    turns = Rotation.from_matrix(poses[posed, :, :3]).as_quat(canonical=True)
+    turns = Rotation.from_matrix(poses[there, :, :3]).as_quat(canonical=True)
     head = f"time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}"
-    rows = np.column_stack([np.asarray(times, np.float64)[posed], poses[posed, :, 3], turns])
+    rows = np.column_stack([np.asarray(times, np.float64)[there], poses[there, :, 3], turns])
     # All digits of a time: microseconds since 1970 have sixteen.
     _write_rows(path, rows, ["%s"] + 7 * ["%.15g"], head)
 

@@ -63,7 +63,7 @@ def of_pair(make: Builder, pair: Pair) -> Steps:
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )
-    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None:
+    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None or not make.graph.asks_for("dem_accuracy"):
         return
     level, dem = (yield from done(pair.level)), (yield from done(pair.dem))
     exact = _truth_dem(make, Lattice.from_dict(dem.meta["lattice"]), pair.frame, level, (pair.frame,), "local")
@@ -87,8 +87,8 @@ def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
     exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
     p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
     if p.world_path is not None:
-        p.truth_risk = make.hazards("risk/truth", [exact])
-        p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=p.truth_risk)
+        true_risk = make.hazards("risk/truth", [exact])
+        p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=true_risk)
 
 
 def _truth(make: Builder, frame: int) -> RigidTransform | None:

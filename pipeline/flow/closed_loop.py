@@ -133,10 +133,11 @@ class TrueStand:
 
 @dataclass(frozen=True)
 class Way:
-    """Record of a leg: row of each frame in the leg's artifact, frames that are not lost, sensors."""
+    """Record of a leg: row of each frame in the leg's artifact, frames that are not lost, and what sensors said."""
 
     rows: dict[int, int]
     frames: list[int]
+    sense: Handle
     said: Ref
 
 
@@ -224,8 +225,7 @@ class Drive:
             stop = self._look(at)
             if stop.index == 0 and self.config.drive.frame == "map":
                 self._on_the_map((yield from done(self._fix())))
-            self._map(stop)
-            yield from self._think(stop)
+            yield from self._think(stop, self._map(stop))
             way = yield from self._drive(stop, at)
             at = yield from self._judge(stop, way)
 
@@ -283,11 +283,11 @@ class Drive:
             )
         return x, y
 
-    def _map(self, stop: Stop) -> None:
-        """What is known of the world at a stop, and its hazards."""
+    def _map(self, stop: Stop) -> Handle:
+        """What is known of the world at a stop, and its hazards; how high the ground may be."""
         p, make, k = self.products, self.make, stop.index
-        stop.trajectory = found = self._located(k)
-        pose, p.world_dem[stop.frame] = make.world_model(self.pairs[k], self.pairs[0], len(self.posed) - 1, found)
+        found, row = self._located(k), len(self.posed) - 1
+        pose, p.world_dem[stop.frame] = make.world_model(self.pairs[k], self.pairs[0], row, found)
         self.poses.append(pose)
         if k == 0 and self.simulation.pad > 0:  # the ground under the vehicle, which no camera sees
             pad = make.node(
@@ -301,16 +301,15 @@ class Drive:
             )
             self.pads = [pad]
         # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
-        stop.merged = self._merged(f"merge/{k}", None)
-        p.world_tiles = [stop.merged]
-        stop.risk = p.world_risk = make.hazards(f"risk/{k}", [stop.merged])
-        near, finest = stop.merged, None
+        near, finest = self._merged(f"merge/{k}", None), None
+        p.world_tiles = [near]
+        stop.risk = p.world_risk = make.hazards(f"risk/{k}", [near])
         if self.config.drive.detail > 0:
             stop.far = stop.risk
             finest = self.config.vehicle.wheel_diameter / self.config.drive.detail
             near = self._merged(f"merge/{k}/near", finest)
             stop.risk = make.hazards(f"risk/{k}/near", [near])
-        stop.ceiling = self._ceiling(f"occlusion_bounds/{k}", near, finest)
+        return self._ceiling(f"occlusion_bounds/{k}", near, finest)
 
     def _located(self, legs: int) -> Handle[TrajectoryFacts]:
         """The trajectory over so many legs, which is that of the drive from now on."""
@@ -341,10 +340,10 @@ class Drive:
         """The part of the world that is mapped."""
         return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
 
-    def _think(self, stop: Stop) -> Generator[Wait, Any, None]:
+    def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
         """Plan the next leg by what is known at a stop, anew where a way turns out to be closed."""
-        known = {"risk": stop.risk, "far": stop.far, "ceiling": stop.ceiling, "pose": self.poses[-1]}
-        follows, label = "again", f"leg/{stop.index}"
+        known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
+        follows, label, thoughts = "again", f"leg/{stop.index}", 0
         while follows == "again":
             driven = self.products.trajectory
             stop.leg = self._leg(label, self.memory, {}, before=self.planned, driven=driven, **known)
@@ -352,8 +351,8 @@ class Drive:
             where = None if leg["where"] is None else tuple(leg["where"])
             follows = self.memory.after(leg["verdict"], where)
             if follows == "again":
-                stop.thoughts += 1
-                label = f"leg/{stop.index}/{stop.thoughts}"
+                thoughts += 1
+                label = f"leg/{stop.index}/{thoughts}"
         if follows == "end":
             stop.event = leg["reason"]
             raise EndedError(leg["verdict"], leg["reason"])
@@ -378,8 +377,8 @@ class Drive:
         if change is not None:
             given["scene"] = self.scene = make.source(change, f"obstacle/{k}", given)
         stop.drive = make.source(s.drive(self.config.vehicle, k, at.row), f"drive/{k}", given)
-        stop.sense = make.source(s.sense(k), f"sense/{k}", {"drive": stop.drive})
-        there, said = yield [stop.drive, stop.sense]
+        sense = make.source(s.sense(k), f"sense/{k}", {"drive": stop.drive})
+        there, said = yield [stop.drive, sense]
         first = max(self.true) + 1
         rows = {stop.frame: 0}
         for row, pose in enumerate(there.meta["poses"][1:], start=1):
@@ -390,7 +389,7 @@ class Drive:
             raise EndedError("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
         moved = yield [make.motion(a, b) for a, b in pairwise(rows)]
         kept = self._kept(stop, rows, [float(m.meta["match_rate"] or 0.0) for m in moved])
-        return Way(rows, kept, said)
+        return Way(rows, kept, sense, said)
 
     def _kept(self, stop: Stop, rows: dict[int, int], rate: list[float]) -> list[int]:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
@@ -416,22 +415,17 @@ class Drive:
         """Track and resect the images of a leg: it is over at its end, or where a safety stop or an obstacle was."""
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
         segment = self.make.segment(frames, key)
-        self.products.tracks.append(segment.track)
-        assert stop.sense is not None
-        stop.safety = self.make.node(
+        safe = self.make.node(
             fault_monitor_stage,
             f"fault_monitor/{stop.index}",
-            sense=stop.sense,
+            sense=way.sense,
             resect=segment.resection,
             rows=[rows[f] for f in frames],
             vehicle=self.make.given_vehicle,
             **self.mounting,
         )
-        judges = [stop.safety]
-        if self.config.obstacle_monitor.enabled:
-            stop.obstacle = self._obstacles(stop, way, segment, key)
-            judges.append(stop.obstacle)
-        safety, *others = yield judges
+        watched = [self._obstacles(stop, way, segment, key)] if self.config.obstacle_monitor.enabled else []
+        safety, *others = yield [safe, *watched]
         cut, kind, reason = safety.meta["stop"], safety.meta["kind"], safety.meta["reason"]
         for monitor in others:
             seen = monitor.meta["stop"]
@@ -445,7 +439,6 @@ class Drive:
                 frames = frames[: cut + 1]
                 stop.row = rows[frames[-1]]
                 segment = self.make.segment(frames, key, which=f"{stop.frame}/stopped")
-                self.products.tracks[-1] = segment.track
         stop.frames = frames
         self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(segment.resection)
@@ -500,8 +493,8 @@ class Drive:
         source = self.simulation.truth_dem(self.arena().to_dict(), T_truth_world, stops)
         exact = make.source(source, "truth_dem", {"scene": self.scene})
         p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
-        p.truth_risk = make.hazards("risk/truth", [exact])
-        best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=p.truth_risk, pose=self.poses[0])
+        true_risk = make.hazards("risk/truth", [exact])
+        best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=true_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 
     def _closed(self) -> str:

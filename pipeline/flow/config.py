@@ -12,8 +12,9 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import numpy as np
 import tomli_w
 from pydantic import Field, create_model
 
@@ -33,20 +34,9 @@ So many points because models that are half as wrong show half as small an error
 """
 
 
-class Follows(NamedTuple):
-    """Values that suit another one: where ``section.key`` is ``value``, ``sets`` lies beneath what the user gives."""
-
-    section: str
-    key: str
-    value: Any
-    sets: dict[str, Any]
-
-
-ACCURATE_FOLLOWS = (Follows("hfvm", "preset", "accurate", {"locus": {"refined_share": 0.5}}),)
-"""What follows of that preset where the user has overruled none of these values.
-
-With an accurate matcher the mean of what the disparity says and of what the images show is better than either.
-"""
+OF_BOTH: dict[str, Any] = {"locus": {"refined_share": 0.5}}
+"""What it sets besides where the matcher is accurate: the mean of what the disparity says and of what the images show
+is better than either."""
 
 NAVIGATION: dict[str, Any] = {
     "hfvm": {"preset": "fast"},
@@ -174,8 +164,20 @@ def merge(into: dict[str, Any], layer: Mapping[str, Any], within: str = "") -> d
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value, f"{within}{key}.")
         else:
-            into[key] = dict(value) if isinstance(value, Mapping) else value
+            into[key] = merge({}, value) if isinstance(value, Mapping) else _plain(value)
     return into
+
+
+def _plain(value: Any) -> Any:
+    """A value as Python has it, where it is NumPy's, as those of sweeps are."""
+    if isinstance(value, np.ndarray):
+        value = list(value) if value.ndim else value[()]
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.floating):
+        # By its own digits: .002 of single precision is .002, not .0020000000949949026.
+        return float(str(value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def refuse_other_sections(given: Iterable[str], own: Sequence[str], command: str) -> None:
@@ -211,10 +213,8 @@ def build(*layers: Mapping[str, Any]) -> Params:
         merge(nested, layer)
     if _preset(nested, "terrain") == "accurate":
         nested = _beneath(nested, ACCURATE_TERRAIN)
-        for one in ACCURATE_FOLLOWS:
-            given = nested[one.section]
-            if isinstance(given, Mapping) and given[one.key] == one.value:
-                nested = _beneath(nested, one.sets)
+        if _preset(nested, "hfvm") == "accurate":
+            nested = _beneath(nested, OF_BOTH)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
     return validate(model(), nested, also=DATASET_SECTIONS)

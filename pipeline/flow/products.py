@@ -19,20 +19,13 @@ class Stop:
 
     index: int
     frame: int
-    merged: Handle[terrain.MergeFacts] | None = None
     risk: Handle | None = None
     far: Handle | None = None
-    ceiling: Handle | None = None
-    trajectory: Handle[odometry.TrajectoryFacts] | None = None
     leg: Handle | None = None
     drive: Handle | None = None
-    sense: Handle | None = None
-    safety: Handle | None = None
-    obstacle: Handle | None = None
     frames: list[int] = field(default_factory=list)
     row: int = -1
     event: str = ""
-    thoughts: int = 0
 
 
 @dataclass
@@ -73,7 +66,6 @@ class Products:
     local_dem: dict[int, Handle[terrain.DemFacts]] = field(default_factory=dict)
     local_risk: dict[int, Handle] = field(default_factory=dict)
     local_path: dict[int, Handle] = field(default_factory=dict)
-    tracks: list[Handle[odometry.TrackFacts]] = field(default_factory=list)
     resections: list[Handle[odometry.ResectFacts]] = field(default_factory=list)
     intrinsics: Handle[odometry.IntrinsicsFacts] | None = None
     moving: dict[int, Handle[odometry.MovingFacts]] = field(default_factory=dict)
@@ -91,6 +83,5 @@ class Products:
     disparity_accuracy: dict[int, Handle[evaluation.MetricsFacts]] = field(default_factory=dict)
     local_dem_accuracy: dict[int, Handle[evaluation.DemAccuracyFacts]] = field(default_factory=dict)
     dem_accuracy: Handle[evaluation.DemAccuracyFacts] | None = None
-    truth_risk: Handle | None = None
     path_check: Handle[evaluation.MetricsFacts] | None = None
     drive: Driven | None = None

@@ -103,11 +103,6 @@ TILE_CELLS = 512
 SEAMS = 24
 """Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
 
-SUSPECTS = 12
-"""Pairs of doubtful rows that are compared with right images of other times at once."""
-
-PLACES_FRAMES = 500
-"""Frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks."""
 
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
@@ -169,7 +164,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
-        p.tracks, p.resections = [s.track for s in segments], [s.resection for s in segments]
+        p.resections = [s.resection for s in segments]
         asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break
@@ -316,8 +311,10 @@ def simultaneous(
         judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
         suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
         if suspects:
-            asked = make.synchrony(f"synchrony{which}", spread(suspects, SUSPECTS), chain)
-            p.contradictions += [asked, make.repetition(f"repetition{which}", spread(suspects, SUSPECTS))]
+            # 12: pairs of doubtful rows that are compared with right images of other times at once.
+            shown = spread(suspects, 12)
+            asked = make.synchrony(f"synchrony{which}", shown, chain)
+            p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
             timed = yield from done(asked)
             contradicted = any("contradiction" in one.meta for one in (timed, *judged))
             if contradicted and 2 * len(suspects) > len(basic):
@@ -361,7 +358,7 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
         if "reference" not in one.level.spec.args:
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
-        make.graph.flow(assessment.of_pair(make, pair), lays=("dem_accuracy",))
+        make.graph.flow(assessment.of_pair(make, pair))
     return pairs
 
 
@@ -480,7 +477,8 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
         return []
     of, blocks = {pair.frame: pair for pair in pairs}, list[Handle[PlacesFacts]]()
     # Cut by frame numbers: where a pair is left out, the other blocks keep theirs.
-    for number, group in groupby(of, lambda frame: frame // PLACES_FRAMES):
+    # 500: frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks.
+    for number, group in groupby(of, lambda frame: frame // 500):
         here = list(group)
         features = [make.features(frame, "left") for frame in here]
         blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import Reads, RunView
 from rille.pipeline.report import canvas, figures, gather, ranges, strips, tables, terrain_map
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene
 from rille.pipeline.report.words import spread
 from rille.stages.core.errors import RilleError
+
+Maker = Callable[[Scene], Block | None]
 
 
 def _disparity(scene: Scene) -> Block | None:
@@ -116,30 +117,23 @@ def _elevation_error(scene: Scene) -> Block | None:
     return Block((figures.raster(values, label, alt, extent=error.lattice.bounds, bound=bound),))
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A figure of the page: how it is drawn, and what it reads of a run."""
+def draw(title: str, maker: Maker, view: RunView) -> Figure:
+    """Draw a figure of the page; none where the run does not have what it shows."""
+    try:
+        return Figure(title, maker(Scene(view)))
+    except (OSError, MemoryError, RilleError):  # not the figure's own fault: another try may draw it
+        raise
+    except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
+        return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}")
 
-    title: str
-    maker: Callable[[Scene], Block | None]
-    reads: Callable[[RunView], tuple[object, ...]]
 
-    def figure(self, view: RunView) -> Figure:
-        """Draw it; none where the run does not have what it shows."""
-        try:
-            return Figure(self.title, self.maker(Scene(view)))
-        except (OSError, MemoryError, RilleError):  # not the figure's own fault: another try may draw it
-            raise
-        except Exception as error:  # a figure must not cost the run its report; the failure is shown in it
-            return Figure(self.title, why=f"drawing failed, {type(error).__name__}: {error}")
+def _drawing(title: str, maker: Maker, reads: Reads) -> Output:
+    """Row of a figure: a part of the page, kept as JSON."""
 
-    def output(self) -> Output:
-        """Its row as an output: a part of the page, kept as JSON."""
+    def write(path: Path, run: RunView) -> None:
+        path.write_bytes(FIGURE.dump_json(draw(title, maker, run)))
 
-        def write(path: Path, run: RunView) -> None:
-            path.write_bytes(FIGURE.dump_json(self.figure(run)))
-
-        return Output(self.title, "", "", write, reads=self.reads)
+    return Output(title, "", "", write, reads=reads)
 
 
 def _of_map(run: RunView) -> tuple[object, ...]:
@@ -158,21 +152,19 @@ def _of_trajectory(run: RunView) -> tuple[object, ...]:
     return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy
 
 
-DRAWINGS = (
-    Drawing("Map", terrain_map.block, _of_map),
-    Drawing(
+OUTPUTS = (
+    _drawing("Map", terrain_map.block, _of_map),
+    _drawing(
         "Drive",
         strips.drive,
         lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.products.accuracy),
     ),
-    Drawing("Disparity", _disparity, lambda run: (run.products.disparity, run.sequence.rig)),
-    Drawing("Stops", strips.pairs, _of_stops),
-    Drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
-    Drawing("Trajectory", _trajectory, _of_trajectory),
-    Drawing("Pairs", _pairs, lambda run: tables.of_pairs(run.products)),
-    Drawing("Elevation error", _elevation_error, lambda run: (run.products.dem_accuracy,)),
+    _drawing("Disparity", _disparity, lambda run: (run.products.disparity, run.sequence.rig)),
+    _drawing("Stops", strips.pairs, _of_stops),
+    _drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
+    _drawing("Trajectory", _trajectory, _of_trajectory),
+    _drawing("Pairs", _pairs, lambda run: tables.of_pairs(run.products)),
+    _drawing("Elevation error", _elevation_error, lambda run: (run.products.dem_accuracy,)),
 )
 """All figures of the page; the template places them."""
-
-OUTPUTS = tuple(drawing.output() for drawing in DRAWINGS)
 STAGE = stage("output.figures", "Figures of the report", OUTPUTS)

@@ -167,7 +167,7 @@ def trajectory(view: RunView) -> Track:
     if bundle is None:
         return Track(nowhere, None, nowhere[:, 0], nothing, nothing)
     poses = rigid.by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
-    there = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    there = rigid.posed(poses)
     variances = np.trace(by_frame(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
     segment, piece = (np.nan_to_num(by_frame(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
     return Track(

@@ -11,11 +11,12 @@ import numpy as np
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.gather import Scene, facts_of
+from rille.stages.evaluation.hand_eye import WITHOUT
 
 Metric = dict[str, Any]
 Rows = list[dict[str, Any]]
 
-LABELS: Mapping[str, str] = {
+LABELS = {
     "drift": "Drift at the end",
     "position_drift": "Drift, positions only, after the fit",
     "path_length": "True length of the drive",
@@ -35,6 +36,7 @@ LABELS: Mapping[str, str] = {
     "unseen": "Cells that not both cameras see",
     "tilt": "Vertical off by",
 }
+LABELS |= {without: f"{LABELS[name]}, turn and shift of the truth's body left out" for name, without in WITHOUT.items()}
 """Words for names of assessing stages, in the order of the page; all others say by themselves what they are."""
 
 AGREEMENT: Mapping[str, str] = {
@@ -141,9 +143,7 @@ def _assessed(
 
 
 def _label(name: str) -> str:
-    """``ate_first_frame_rmse`` to ``ATE first frame RMS``; with the truth's body moved as without that."""
-    if (label := LABELS.get(name.removeprefix("hand_eye_"))) is not None:
-        return f"{label}, turn and shift of the truth's body left out"
+    """``ate_first_frame_rmse`` to ``ATE first frame RMS``."""
     first, *rest = name.replace("rmse", "RMS").split("_")
     return " ".join([first.upper() if first in ("ate", "rpe") else first[0].upper() + first[1:], *rest])
 

@@ -36,8 +36,6 @@ PLANNED_SHARE = 0.75
 """Part of the budget that columns like the middle one take: others may need more."""
 MAX_WIDTH_PIXELS, MIN_WIDTH_PIXELS = 400, 140
 """Widths of a column; 400 pixels are twice what it takes on the screen."""
-MAX_HEIGHT_OVER_WIDTH = 1.2
-"""Bound of the shape of one picture of a column."""
 LEGEND = tuple(zip(canvas.RISK, canvas.CLASS_NAMES, strict=True))
 
 
@@ -164,10 +162,11 @@ def _photo(pixels: NDArray[np.uint8], width: int) -> Image:
 
 
 def _scaled(picture: Image, width: int) -> Image:
-    """As wide as the column, or lower than ``MAX_HEIGHT_OVER_WIDTH`` allows."""
+    """As wide as the column, or less wide where it would become too high."""
     from PIL import Image
 
-    factor = min(width / picture.width, MAX_HEIGHT_OVER_WIDTH * width / picture.height)
+    # 1.2: bound of the shape of one picture of a column.
+    factor = min(width / picture.width, 1.2 * width / picture.height)
     size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
     return picture.resize(size, Image.Resampling.BOX if factor < 1 else Image.Resampling.NEAREST)
 

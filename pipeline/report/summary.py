@@ -22,6 +22,7 @@ from rille.pipeline.report.metrics import metric, metrics
 from rille.stages.core.quantities import metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
+from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
@@ -123,7 +124,7 @@ def given_numbers(view: RunView) -> list[str]:
     known = [] if delivery.on_plane(view) else [level.meta for level in levels if level is not None]
     grounds = [facts["footprint"] for facts in known if facts.get("footprint")]
     poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
-    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    poses = poses[rigid.posed(poses)]
     steps = np.einsum("nji,nj->ni", poses[:-1, :, :3], np.diff(poses[:, :, 3], axis=0))
     long = np.linalg.norm(steps, axis=1)
     if not long.sum() > 0:
@@ -351,7 +352,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
-NOT_IN_FACTS = ("images", "undistorted", "tracks", "world_dem", "truth_risk")
+NOT_IN_FACTS = ("images", "undistorted", "world_dem")
 """Products that the facts are not made of."""
 
 

@@ -19,7 +19,7 @@ from rille.datasets.text.count import count
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
-from rille.stages.geometry.rigid import angles_between
+from rille.stages.geometry.rigid import angles_between, lengths_along
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.hfvm.given import MAX_REPEATED_SHARE
 from rille.stages.odometry.frame_screening import FrameScreeningParams
@@ -211,7 +211,7 @@ def judge_truth(
     """How many frames have truth, and how long the way is."""
     if truth is None and positions is not None:
         places, times = np.array(positions.positions), positions.times
-        length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        length = float(lengths_along(places)[-1])
         when = "one a frame" if times is None else f"{times[0]:.2f} to {times[-1]:.2f} s, a constant offset is found"
         axes = "x, y, z" if places.shape[1] == 3 else "x, y"
         rows = f"positions only ({axes}), {len(places)} rows, {length:.4g} m, {when}"

@@ -32,7 +32,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
-from rille.pipeline.export.view import UNSTATED, RunView
+from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
@@ -69,17 +69,6 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     return chosen
 
 
-@dataclass(frozen=True)
-class Settled:
-    """Input of a command; ``given``: dotted keys set by the user, ``vehicle_source``: the source of the limits."""
-
-    sequence: Sequence
-    frames: tuple[int, ...]
-    config: Any
-    vehicle_source: str
-    given: tuple[str, ...]
-
-
 def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the user has set, by section: of the sequence, and of the stages."""
     given = read_toml(options.config, "configuration") if options.config else {}
@@ -108,7 +97,8 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
         raise error.at(f"defaults of {sequence.name}") from error
     config = configuration.build(*layers, for_stages)
     given = unread.set_by_user(for_stages, config, suited)
-    return Settled(sequence, choose_frames(options.frames, sequence.frames), config, source, given)
+    frames = choose_frames(options.frames, sequence.frames)
+    return Settled(sequence=sequence, frames=frames, config=config, vehicle_source=source, given=given)
 
 
 def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
@@ -161,7 +151,6 @@ class _Opened:
     """A run that is configured and laid out: ``view`` for the report, ``folder`` for its results."""
 
     options: Options
-    settled: Settled
     view: RunView
     folder: Path
     started: datetime
@@ -169,11 +158,12 @@ class _Opened:
     graph: Graph
     drive: Drive | None
 
-    def late(self, **known: Any) -> RunView:
-        """Return the view with facts that are known late: among them the frames that a drive has taken."""
-        if self.drive is not None:
-            known["sequence"], known["frames"] = self.drive.taken()
-        return replace(self.view, **known)
+
+def late(view: RunView, drive: Drive | None, **known: Any) -> RunView:
+    """The view with facts that are known late: among them the frames that a drive has taken."""
+    if drive is not None:
+        known["sequence"], known["frames"] = drive.taken()
+    return replace(view, **known)
 
 
 def perform(
@@ -197,7 +187,7 @@ def perform(
 
     opened = _open(sequence, options, verb, warn)
     made: run_files.Made = {}
-    opened.graph.last = lambda: run_files.lay_out(opened.graph, opened.late(), made)
+    opened.graph.last = lambda: run_files.lay_out(opened.graph, late(opened.view, opened.drive), made)
     result = _compute(opened, kept)
     remember()
     report = _write(opened, result, made)
@@ -252,22 +242,18 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     atomic.write(folder / "config.toml", text)
     view = RunView(
+        **vars(settled),
         run_id=folder.name,
-        sequence=sequence,
-        frames=frames,
         products=products,
-        tasks=(),
-        config=config,
         config_toml=text,
         versions=installed(),
         command=command,
-        vehicle_source=settled.vehicle_source,
         started=started.strftime("%Y-%m-%dT%H:%M:%SZ"),
         part=options.part(),
         until=options.until,
         only=options.only,
     )
-    return _Opened(options, settled, view, folder, started, store, graph, drive)
+    return _Opened(options, view, folder, started, store, graph, drive)
 
 
 def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
@@ -308,7 +294,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
         # Without facts there is no report: the run fails with the error that kept them from being computed.
         result.check()
     tasks = run_files.task_rows(opened.graph, result.failures)
-    whole = opened.late(tasks=tasks, seconds=result.seconds, left_out=result.left_out)
+    whole = late(opened.view, opened.drive, tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
     events.add_facts(opened.folder / LEDGER, total=total, holes=not is_complete(report["missing"]))
@@ -318,7 +304,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
 def _idle(opened: _Opened) -> Iterator[str]:
     """Errors of a run that came to its end: a parameter that no task of it read, and stages that it does not have."""
     # What a part of a run does not read may be meant for the rest.
-    if not opened.view.part and (lost := unread.unread(opened.settled.given, opened.view.config, opened.graph)):
+    if not opened.view.part and (lost := unread.unread(opened.view.given, opened.view.config, opened.graph)):
         error = unread.error(lost, opened.view.config)
         yield f"rille: error {error.code}: {error}"
     idle = sorted(opened.options.force - {h.stage for h in opened.graph.nodes})

@@ -49,11 +49,6 @@ BEYOND = 1.0
 BEYOND_SHARE = 0.1
 """Share of matches more than ``BEYOND`` pixels beyond infinity from which on depth is wrong; a sky has fewer."""
 
-BEYOND_LEFT = 0.03
-"""Largest share of matches beyond infinity that may remain after a correction that explains the others."""
-
-PRIOR_ROTATION_DEG, PRIOR_BASELINE_DEG = 0.05, 0.2
-"""Standard deviations [degrees] of each rotation angle, and of the baseline's direction, of an intact calibration."""
 
 SYSTEMATIC_PX = 0.1
 """Smooth row error [pixels RMS over the image] that no rig explains and more matches do not reduce: remains of lens
@@ -91,9 +86,10 @@ class RelativeParams(Params):
 
     def priors(self, rig: Rig) -> Priors:
         """Prior standard deviations of a rig, in radians and pixels."""
+        # Standard deviations of an intact calibration: of each rotation angle, and of the baseline's direction.
         return Priors(
-            math.radians(PRIOR_ROTATION_DEG),
-            math.radians(PRIOR_BASELINE_DEG),
+            math.radians(0.05),
+            math.radians(0.2),
             (self.prior_principal * rig.right.fx, self.prior_principal * rig.right.fy),
             SYSTEMATIC_PX,
         )
@@ -250,7 +246,8 @@ class _Chooser:
             return False
         x, _, _ = self._solve([*chosen, i], rival=False)
         free = np.isin(np.arange(RIG), [*chosen, i])
-        return impossible_share(corrected(self.rig, np.where(free, x[:RIG], 0.0)), self.pairs, self.all) < BEYOND_LEFT
+        # 0.03: largest share of matches beyond infinity that may remain after a correction that explains the others.
+        return impossible_share(corrected(self.rig, np.where(free, x[:RIG], 0.0)), self.pairs, self.all) < 0.03
 
     def _asked(self, i: int, chosen: list[int]) -> _Asked:
         x, covariance, _ = self._solve([*chosen, i], rival=False)

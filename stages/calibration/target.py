@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.rigid import angle
-from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
 MODELS: Mapping[str, tuple[str, ...]] = {
     "radtan": ("k1", "k2", "p1", "p2", "k3"),
@@ -38,14 +38,8 @@ LEAST_VIEWS = 3
 CORNER_SCALE = 0.5
 """Pixels; residuals beyond it lose weight in the first adjustment. Corners are found to 0.1 - 0.3 px."""
 
-BAD_RATIO, BAD_PX = 4.0, 0.5
-"""A view is bad if its RMS residual exceeds both four times the median of all views and half a pixel."""
-
 FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
 """Shares of an image's longer side that are tried as a fisheye's focal length: a diagonal of 220 to 25 degrees."""
-
-MAX_STEPS, SETTLED = 100, 1e-10
-"""Largest number of steps of an adjustment, and the relative decrease of its cost at which it has converged."""
 
 MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
@@ -121,7 +115,8 @@ def calibrate_rig(
     x = replace(task, robust=True).solve(task.solve(task.start()) if model == "fisheye" else task.start())
     first = task.residuals(x)
     # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
-    limit = max(BAD_PX, BAD_RATIO * float(np.median([r.worst for r in first])))
+    # A view is bad if its RMS residual exceeds both half a pixel and four times the median of all views.
+    limit = max(0.5, 4.0 * float(np.median([r.worst for r in first])))
     good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
     used = Adjustment(board, tuple(views[k] for k in good), sizes, model)
     _enough(used.views)
@@ -268,20 +263,20 @@ class Adjustment:
             by_lens, by_pose = j[:, 6 : 10 + d.size], j[:, :6]
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
-    def normal(self, x: Floats) -> _Normal:
-        """Normal equations."""
+    def normal(self, x: Floats) -> NormalEquations:
+        """Normal equations; the cost is in pixels squared, infinite where a corner has no image."""
         residual, jacobian = self.evaluate(x)
         # Of each corner, over the distance beyond which it loses weight.
         squares = (residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2
         weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
         weighted = (jacobian * weight[:, None]).T
         cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
-        return _Normal(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
+        return NormalEquations(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
 
-    def ahead(self, x: Floats, normal: _Normal, damping: float) -> Floats:
+    def ahead(self, x: Floats, normal: NormalEquations, damping: float) -> Floats:
         """The unknowns one damped step on."""
         damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
-        return x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0]
+        return np.asarray(x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0])
 
     def solve(self, x: Floats) -> Floats:
         """The unknowns of least cost, from ``x`` on.
@@ -291,7 +286,7 @@ class Adjustment:
         DegenerateError
             The adjustment diverges.
         """
-        x = levenberg_marquardt(self, x, MAX_STEPS, SETTLED).state
+        x = levenberg_marquardt(self, x, 100, 1e-10).state
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
             raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x
@@ -354,14 +349,6 @@ class Adjustment:
         lens = ("fx", "fy", "cx", "cy", *MODELS[self.model])
         rig = [f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
         return [f"{side} {name}" for side in ("left", "right") for name in lens] + rig
-
-
-class _Normal(NamedTuple):
-    """Gauss-Newton matrix and gradient; sum of squares, pixels squared, infinite where a corner has no image."""
-
-    matrix: Floats
-    gradient: Floats
-    cost: float
 
 
 def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:

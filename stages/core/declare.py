@@ -37,9 +37,10 @@ class Params(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse a switch where a number is expected: pydantic would take True for 1."""
-        if isinstance(value, bool) and "bool" not in str(cls.model_fields[str(info.field_name)].annotation):
+    def _no_switch(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse a switch where none is expected: pydantic would take True for 1."""
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        if isinstance(value, bool) and bool not in (annotation, *get_args(annotation)):
             raise ValueError("input should be a number, no switch")
         return value
 

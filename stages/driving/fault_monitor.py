@@ -28,10 +28,6 @@ MAX_ACCELERATION = 3.0
 """Vertical acceleration, m/s2, at which it stops; permitted steps cause less than half of it."""
 MIN_LANDMARKS = 12
 """Landmarks that agree with a pose; six determine it."""
-MAX_SLIP_SHARE = 0.2
-"""Of the distance by the wheels; usual soil: 0.05 to 0.15."""
-MIN_SLIP_WHEELBASES = 0.3
-"""Distance by the wheels from which slip is judged; below, the errors of the poses are as large."""
 MAX_TURN_DEG = 8.0
 """Difference between the turn by the wheels and by the images."""
 
@@ -113,10 +109,12 @@ def _disagreement(wheels: Floats, moved: RigidTransform, base: float) -> str:
         return f"wheels and vision differ by {apart:.1f} degrees in heading, {MAX_TURN_DEG:g} permitted"
     way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
     # Over a short way the error of vision is as large as the slip that is looked for.
-    if way < MIN_SLIP_WHEELBASES * base:
+    # 0.3: distance by the wheels from which slip is judged; below, the errors of the poses are as large.
+    if way < 0.3 * base:
         return ""
     slip = 1.0 - seen / way
-    if abs(slip) <= MAX_SLIP_SHARE:
+    # 0.2: of the distance by the wheels; usual soil: 0.05 to 0.15.
+    if abs(slip) <= 0.2:
         return ""
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
 

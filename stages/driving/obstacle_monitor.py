@@ -31,14 +31,13 @@ from rille.stages.facts.terrain import DemFacts
 from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lattice import Lattice
+from rille.stages.geometry.rigid import posed
 from rille.stages.hazard.vehicle import Vehicle
 
 MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
 LEVEL = 1
 """Pyramid level of the displacements: half the resolution."""
-BASELINE_WHEELS = 1.6
-"""Distance driven between the two compared images [wheel diameters]; larger: less noise."""
 MAX_TURN_DEG = 6.0
 """Largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that the model had
 right."""
@@ -217,7 +216,7 @@ def obstacle_monitor_stage(
     lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
     surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, MODEL_RADIUS_WHEELS * wheel)
     poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
-    known = np.isfinite(poses).all(axis=(1, 2))
+    known = posed(poses)
     frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
     where = np.full((len(frames), 2), np.nan)
@@ -258,7 +257,8 @@ def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:
         for i in range(j - 1, -1, -1):
             if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > MAX_TURN_DEG:
                 break
-            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= BASELINE_WHEELS * wheel - 1e-9:
+            # 1.6: distance driven between the two compared images [wheel diameters]; larger: less noise.
+            if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= 1.6 * wheel - 1e-9:
                 out.append((i, j))
                 break
     return out

@@ -122,8 +122,7 @@ def _absolute(P: Floats, Q: Floats) -> dict[str, Metric]:
 
 def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
     """Errors of the motion between successive frames."""
-    E = rigid.relative_error(P, Q, slice(None, -1), slice(1, None))
-    E = E[posed(E)]
+    E = rigid.relative_error(*rigid.steps(P, Q))
     how = f"RMS error of the motion between successive frames, {len(E)} pairs"
     return {
         "rpe_translation_rmse": metric(rms(E[:, :, 3]), "m", how),
@@ -133,9 +132,7 @@ def _relative(P: Floats, Q: Floats) -> dict[str, Metric]:
 
 def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
     """Error of the scale of the motions between successive frames."""
-    p, q = (rigid.motion(T, slice(None, -1), slice(1, None)) for T in (P, Q))
-    both = posed(p) & posed(q)
-    p, q = p[both, :, 3], q[both, :, 3]
+    p, q = (motions[:, :, 3] for motions in rigid.steps(P, Q))
     if len(p) < 3 or np.linalg.norm(q, axis=1).sum() < 1e-6:
         return {"scale_error": metric("fewer than three motions, or the camera did not move", "%", "")}
     square = float((q * q).sum())

@@ -23,10 +23,6 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.rigid import rms
 from rille.stages.numeric.robust import mad_sigma
 
-REST = 10.0
-"""Ratio of the spread of positions to the error of a step below which a camera counts as at rest: its positions then
-determine no rotation."""
-
 MIN_SIGMAS, MIN_RATIO = 5.0, 2.0
 """Robust standard deviations above the median, and multiple of the median, below which no frame is flagged."""
 
@@ -78,7 +74,7 @@ def compare(
         # Frames whose neighbour before is in the piece as well: a step over a gap is no motion between frames. Errors
         # of motions are in the frame before, and so free of the alignment.
         second = rows[1:][np.diff(rows) == 1]
-        E = rigid.relative_error(theirs, ours, second - 1, second)
+        E = rigid.relative_error(*(rigid.motion(poses, second - 1, second) for poses in (theirs, ours)))
         arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
         arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
@@ -100,7 +96,9 @@ def compare(
 
 def at_rest(poses: Floats, step_distance: Floats) -> bool:
     """Whether all positions lie within what the two trajectories differ by from step to step."""
-    return bool(step_distance.size and rigid.spread(poses) < REST * np.sqrt(np.mean(step_distance**2)))
+    # 10.0: ratio of the spread of positions to the error of a step below which a camera counts as at rest: its
+    # positions then determine no rotation.
+    return bool(step_distance.size and rigid.spread(poses) < 10.0 * np.sqrt(np.mean(step_distance**2)))
 
 
 def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:

@@ -31,8 +31,6 @@ MIN_MISFIT, MAX_SHARE, MAX_MISFIT, MUCH = 0.02, 0.4, 0.1, 0.3
 ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 # Least turn of a body against the camera, radians: an estimate's own errors look like smaller ones.
 MIN_TURN = 0.3
-# Factor on the longest step of the estimate from which on one of the truth is a jump.
-MIN_JUMP = 20.0
 # Factor of length from which on it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
 MIN_UNIT, UNITS = 1.3, (0.001, 0.01, 0.0254, 0.3048, 0.9144, 1000.0)
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
@@ -80,7 +78,8 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     if spread(Q) < MIN_SHARE * spread(P):
         return [f"the truth rests, the trajectory extends {spread(P):.3g} m: is it the right file, and does it go on?"]
     moved, said = (np.linalg.norm(np.diff(T[:, :, 3], axis=0), axis=1) for T in (estimate, truth))
-    jumps = np.flatnonzero(said > MIN_JUMP * moved.max())
+    # 20 times the longest step of the estimate is a jump.
+    jumps = np.flatnonzero(said > 20.0 * moved.max())
     if 0 < len(jumps) < len(said) / 3:
         at, much = jumps[0], f"by {said[jumps[0]]:.3g} m behind {jumps[0] + 1} of its {len(truth)} poses"
         return [f"the truth jumps {much}, the trajectory moves by {moved[at]:.3g} m there: correct or remove that pose"]

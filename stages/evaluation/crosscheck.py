@@ -36,11 +36,6 @@ OVERLAP = 3
 SEED = 0
 """Of COLMAP's random sampling."""
 
-ADJUSTED_GROWTH, ADJUSTED_IMAGES, ADJUSTED_CHANGE, NEW_CHANGE = 3.0, 2, 1e-4, 1e-3
-"""Factor in frames or points by which a model grows before all of it is adjusted again; images that are adjusted with a
-new one; and relative change of the cost below which an adjustment of all, or of these, ends. COLMAP's 1.1, 6, 0 and 0
-take twice the time, and change no error by a tenth."""
-
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""
 
@@ -218,11 +213,13 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     # A pixel of disparity at a focal length of 600 pixels.
     options.mapper.init_min_tri_angle = 0.1
     options.min_model_size, options.extract_colors = 2, False
-    # Adjusted less often on the way, and as well at the end.
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_GROWTH
-    options.mapper.ba_local_num_images = ADJUSTED_IMAGES
+    # Adjusted less often on the way, and as well at the end: when a model has grown threefold, with two images beside a
+    # new one, and until the cost changes by less than a thousandth. COLMAP's 1.1, 6, 0 and 0 take twice the time, and
+    # change no error by a tenth.
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 3.0
+    options.mapper.ba_local_num_images = 2
     options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
-    options.ba_local_function_tolerance, options.ba_global_function_tolerance = NEW_CHANGE, ADJUSTED_CHANGE
+    options.ba_local_function_tolerance, options.ba_global_function_tolerance = 1e-3, 1e-4
     pycolmap.set_random_seed(SEED)
     manager = pycolmap.ReconstructionManager()
     pycolmap.IncrementalPipeline(options, database, manager).run()

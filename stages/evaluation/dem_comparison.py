@@ -94,10 +94,7 @@ class Alignment:
     points: int = 0
 
 
-_AS_IT_IS = RigidTransform.identity()
-
-
-def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = _AS_IT_IS) -> Alignment:
+def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = RigidTransform.identity()) -> Alignment:
     """Motion that brings A onto B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`): the reference's
     slopes are known better.
 

@@ -16,9 +16,6 @@ from rille.stages.evaluation.coverage import within
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
-THRESHOLDS_PX = (1, 2, 4)
-"""An error beyond these counts as bad: bad-1, bad-2, bad-4."""
-
 MIN_MATCHES = 100
 """Matches by which true disparities are doubted."""
 
@@ -65,7 +62,8 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
             error.size / every.size if every.size else None, "1", f"share that is matched; {counts}"
         ),
     }
-    for limit in THRESHOLDS_PX:
+    # (1, 2, 4): an error beyond these counts as bad: bad-1, bad-2, bad-4.
+    for limit in (1, 2, 4):
         words = f"share off by more than {limit} px, "
         # Not "greater": where nothing is known the error is NaN, and bad.
         worse = float(np.mean(~(every <= limit))) if every.size else None

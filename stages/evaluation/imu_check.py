@@ -15,16 +15,13 @@ import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import level_rotation
+from rille.stages.geometry.rigid import posed
 
 # Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
 MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
-# rad/s; the largest bias of a gyroscope, which a unit of degrees would make small, too.
-LARGEST_BIAS = 0.15
 # Of a vertical against the normal of the ground: slopes are less, as far as a run's pairs see them.
 MAX_SLOPE_DEG = 15.0
 MIN_COSINE = np.cos(np.deg2rad(MAX_SLOPE_DEG))
-# Degrees off a pitch over the ground, so no slope, from which another sign of it is a cause.
-MIN_REVERSED_DEG = 5.0
 
 
 @cache
@@ -43,14 +40,14 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     times : (frame,) s.
     axes : (3, 3) R_imu_left.
     """
-    both = np.isfinite(images).all(axis=(1, 2)) & np.isfinite(sensor).all(axis=(1, 2))
+    both = posed(images) & posed(sensor)
     if both.sum() <= 5:
         return []
     steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
-    # A bias turns the sensor, too, and degrees would make it small.
-    fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + LARGEST_BIAS * np.median(np.diff(times[both]))
+    # A bias turns the sensor, too, by 0.15 rad/s at most; a unit of degrees would make it small.
+    fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + 0.15 * np.median(np.diff(times[both]))
     readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
@@ -84,7 +81,8 @@ def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float |
     if pitch is not None:
         stated, found = np.degrees([pitch, np.arctan2(-seen[2], -seen[1])])
         rest = abs(found + stated)
-        reversed_fits = off > MIN_REVERSED_DEG and rest < MAX_SHARE * off
+        # 5 degrees off a pitch over the ground, so no slope: another sign of it is a cause.
+        reversed_fits = off > 5.0 and rest < MAX_SHARE * off
         if off <= MAX_SLOPE_DEG and not reversed_fits:
             return []
         line = (

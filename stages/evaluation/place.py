@@ -25,9 +25,6 @@ from rille.stages.terrain.relief.grid import Grid
 FEWEST, MOST_SCALE = 12, 0.03
 """Matches that must agree, and departure of their scale from 1."""
 
-MAX_RATIO, MIN_CONTRAST = 1.5, 16.0
-"""Of cells, above which the finer image is averaged; and of grey values: paler images are stretched."""
-
 
 def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
     """Find where A lies in B, without a start, by the ortho images of both or else their elevations, all in metres.
@@ -103,12 +100,12 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
 
 def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
-    while other > MAX_RATIO * image.cell:
+    while other > 1.5 * image.cell:
         image = image.halved()
     grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
     known, matrix = np.isfinite(image.values).astype(np.float32), image.matrix
     low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)
-    if low < 0 or high > 255 or high - low < MIN_CONTRAST:  # of other units, or pale
+    if low < 0 or high > 255 or high - low < 16.0:  # of other units, or pale
         grey = (grey - low) * (255.0 / max(high - low, 1e-12))
     # The edge of what is known is no texture: unknown cells get what is around them.
     around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), 4.0) for v in (np.where(known > 0, grey, 0), known)]

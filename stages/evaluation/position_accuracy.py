@@ -23,9 +23,9 @@ from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import counts, over_length
 from rille.stages.evaluation.clock import MIN_FRAMES, Offset, TruePositions, find_offset
 from rille.stages.evaluation.conventions import UNITS
-from rille.stages.evaluation.hand_eye import MIN_LEVER_FRAMES, fit_lever_arm
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
+from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
 from rille.stages.geometry.rigid import by_frame, fit_rigid, in_both, rms
 from rille.stages.odometry.resection.trajectory import world_poses
 

@@ -48,9 +48,16 @@ def motion(poses: Floats, first: Any, last: Any) -> Floats:
     return compose(inverse(poses[first]), poses[last])
 
 
-def relative_error(P: Floats, Q: Floats, first: Any, last: Any) -> Floats:
-    """Errors (..., 3, 4) of the motions of P (frame, 3, 4) against those of Q: ``motion(Q)^-1 motion(P)``."""
-    return compose(inverse(motion(Q, first, last)), motion(P, first, last))
+def steps(P: Floats, Q: Floats) -> tuple[Floats, Floats]:
+    """Motions (n, 3, 4) of P and Q (frame, 3, 4) between successive frames, of those alone that both have."""
+    p, q = (motion(T, slice(None, -1), slice(1, None)) for T in (P, Q))
+    both = posed(p) & posed(q)
+    return p[both], q[both]
+
+
+def relative_error(p: Floats, q: Floats) -> Floats:
+    """Errors ``q^-1 p`` (..., 3, 4) of motions p against q (..., 3, 4)."""
+    return compose(inverse(q), p)
 
 
 def angle(T: Floats) -> Floats:
@@ -89,36 +96,36 @@ def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
 
 
 class Fit(NamedTuple):
-    """Truth moved into the world: (frame, 2 or 3) m; ``error``: RMS, m; ``relative``: over the extent of the tracks."""
+    """Positions ``moved`` (n, 2 or 3), m; ``error``: RMS that is left, m; ``relative``: that over both sets' extent."""
 
     moved: Floats
     error: float
     relative: float
 
 
-def fit_rigid(estimate: Floats, truth: Floats, upright: bool = True) -> Fit:
-    """Truth (frame, 2 or 3) turned and shifted to the estimated positions (frame, 3), m.
+def fit_rigid(target: Floats, source: Floats, upright: bool = True) -> Fit:
+    """Positions ``source`` (n, 2 or 3) turned and shifted to those of ``target`` (n, 3), m.
 
-    It is turned about the vertical alone where the world is ``upright``, i.e. its vertical was measured, and where the
-    truth has no heights. Rows of NaN in either do not count, but are moved as well.
+    They are turned about the vertical alone where both are ``upright``, i.e. have one vertical, and where the source
+    has no heights. Rows of NaN in either do not count, but are moved as well.
     """
-    width = truth.shape[1]
-    both = in_both(estimate, truth)
+    width = source.shape[1]
+    both = in_both(target, source)
     if not both.any():
-        return Fit(np.full_like(truth, np.nan), np.inf, np.inf)
-    centre, origin = estimate[both, :width].mean(axis=0), truth[both].mean(axis=0)
-    a, b = estimate[:, :width] - centre, truth - origin
+        return Fit(np.full_like(source, np.nan), np.inf, np.inf)
+    centre, origin = target[both, :width].mean(axis=0), source[both].mean(axis=0)
+    a, b = target[:, :width] - centre, source - origin
     turned = 2 if upright else width
     b[:, :turned] = b[:, :turned] @ umeyama(b[both, :turned], a[both, :turned])[0].T
     error = rms(a[both] - b[both])
-    # Against the extent of both tracks: else the offset wins that compares the fewest, nearest frames.
+    # Against the extent of both sets: else the offset wins that compares the fewest, nearest frames.
     extent = np.hypot(rms(a[both]), rms(b[both]))
     return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
 
 
-def in_both(estimate: Floats, truth: Floats) -> Bools:
-    """Frames (frame,) that have an estimated (frame, 3) and a true position (frame, 2 or 3)."""
-    return np.asarray(np.isfinite(estimate).all(axis=1) & np.isfinite(truth).all(axis=1))
+def in_both(a: Floats, b: Floats) -> Bools:
+    """Rows (n,) that are there, i.e. without NaN, in both sets of positions (n, 2 or 3)."""
+    return np.asarray(np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))
 
 
 def spread(poses: Floats) -> float:

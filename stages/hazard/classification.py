@@ -53,11 +53,6 @@ LIFT = 0.8
 more often than it makes some. Fitted, as where it begins, with the noise of :mod:`rille.stages.hazard.measures`; F
 stays a rising function."""
 
-LIFT_START_EXCESS = -0.4
-"""Excess from which t is raised."""
-
-LIFT_WIDTH_EXCESS = 0.6
-"""Excess over which the rise of t grows to the whole of it."""
 
 NO_BITS = np.uint16(0)
 
@@ -208,7 +203,8 @@ def _chance(excess: Floats32) -> Floats32:
 def _table() -> Floats32:
     """F (entry,) at steps of the excess."""
     t = np.arange(-MAX_EXCESS * STEPS_PER_EXCESS, MAX_EXCESS * STEPS_PER_EXCESS + 1) / STEPS_PER_EXCESS
-    raised = np.clip((t - LIFT_START_EXCESS) / LIFT_WIDTH_EXCESS, 0.0, 1.0)
+    # t is raised from an excess of -0.4 on, and to the whole of it over another 0.6.
+    raised = np.clip((t + 0.4) / 0.6, 0.0, 1.0)
     # Three degrees of freedom.
     chance = scipy.special.stdtr(3.0, t + LIFT * raised)
     # Beyond the ends of the table the probability counts as certain, whatever the tails of Student's t.

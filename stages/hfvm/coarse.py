@@ -224,16 +224,6 @@ def greatest(ratio: Floats) -> float:
 COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
 
-MIN_UPRIGHT_SHARE = 0.6
-"""Share of consistent pixels below which the images may be turned, or far apart: chance alone makes up to .23 of them
-so, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more."""
-
-MIN_MANY_SHARE = 0.8
-"""Share of consistent pixels below which a plane need explain fewer of them."""
-
-MIN_EVEN_SHARE = 0.85
-"""Share of consistent pixels from which on no other brightness is guessed."""
-
 
 @dataclass(frozen=True)
 class Coarse:
@@ -280,7 +270,8 @@ class Coarse:
 def even(coarse: Coarse) -> Coarse:
     """Brightness ratio of both images undone in the right one, first by a guess where little matches."""
     left = coarse.images.left
-    if coarse.share < MIN_EVEN_SHARE:
+    # 0.85: share of consistent pixels from which on no other brightness is guessed.
+    if coarse.share < 0.85:
         guessed = guess(left, coarse.given, min(COARSE_LEVEL + 2, coarse.images.levels - 1))
         if greatest(guessed) > MIN_LOG_RATIO:
             tried = coarse.anew(ratio=guessed)
@@ -309,7 +300,8 @@ def known(coarse: Coarse) -> Coarse:
 
 def align(coarse: Coarse) -> Coarse:
     """The right image aligned by the dominant plane, where one explains the matches."""
-    few = coarse.share < MIN_MANY_SHARE
+    # 0.8: share of consistent pixels below which a plane need explain fewer of them.
+    few = coarse.share < 0.8
     h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
     return coarse if h is None else known(coarse.anew(alignment=h))
 
@@ -319,7 +311,9 @@ def turn(coarse: Coarse) -> Coarse:
     # A plane may also be fitted to the few matches that chance makes.
     left, given = coarse.images.left, coarse.given
     unlike = coarse.alignment is None and other_size(left.shapes[0], given.shapes[0])
-    few = unlike or coarse.share <= MIN_UPRIGHT_SHARE
+    # 0.6: share of consistent pixels below which the images may be turned, or far apart: chance alone makes up to .23
+    # of them so, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more.
+    few = unlike or coarse.share <= 0.6
     h = plane.find_turn(left, given) if few and coarse.prior is None else None
     if h is None:
         return coarse

@@ -36,9 +36,6 @@ TERM_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
 SHARP_SPREAD_PX = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
-PLAIN_SPREAD_PX = 0.05
-"""Pixels: median distance of matches from lines along the rows beyond which lines along the columns may be likelier.
-A plane lies on lines of either kind; relief of less than half a pixel tells them apart."""
 
 MIN_MATCHES = 40
 
@@ -69,7 +66,9 @@ def fit_points(
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
     f, cost, spread = _solve(p, q, MATCH_SIGMA_PX / scale)
-    if spread * scale > PLAIN_SPREAD_PX:
+    # 0.05 pixels: median distance of matches from lines along the rows beyond which lines along the columns may be
+    # likelier. A plane lies on lines of either kind; relief of less than half a pixel tells them apart.
+    if spread * scale > 0.05:
         cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
         if cols[1] < cost:
             f, spread = transposed(cols[0]), cols[2]

@@ -124,11 +124,6 @@ SEARCH_REACH_PX = 64
 MIN_APART_PX = 8
 """Pixels: how far from its match a likeness counts."""
 
-MIN_CORRELATION = 0.7
-"""Least correlation of a match whose patch says anything."""
-
-MAX_CORRELATION_LOSS = 0.05
-"""By how much less than the match a likeness may correlate."""
 
 MIN_RIGID_SHARE = 0.75
 """Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
@@ -201,13 +196,15 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         j, i = j + y0 + PATCH_RADIUS_PX, i + x0 + PATCH_RADIUS_PX
         # The match has been rounded, so that its peak may lie beside it.
         own = float(score[np.hypot(j - q, i - p) <= 2].max())
-        if not np.isfinite(own) or own < MIN_CORRELATION:
+        # 0.7: least correlation of a match whose patch says anything.
+        if not np.isfinite(own) or own < 0.7:
             continue
         # Without lines the row through the match stands in.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
         here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
         elsewhere = score[here & (np.hypot(j - q, i - p) >= MIN_APART_PX)]
-        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - MAX_CORRELATION_LOSS)
+        # 0.05: by how much less than the match a likeness may correlate.
+        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
 
 

@@ -145,9 +145,6 @@ DEVIATION = 6
 VARIANCE_RADIUS_PX = 2
 """Pixels; the paper gives no window for the variance, 5 x 5 is our choice."""
 
-STEPS_PER_UNIT = 2.0
-"""Byte steps per weighted unit: with the default weights of 4 the strongest edges just fill a byte."""
-
 
 def planes(image: AnyArray) -> Planes:
     """Features of Table 1, each divided by its normalisation.
@@ -215,7 +212,8 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, AnyArray]:
     deviation : (row, col) float32, local standard deviation, grey levels (feature 6).
     """
     words, deviation = np.zeros(image.shape, np.uint64), np.empty(image.shape, np.float32)
-    scale = np.asarray(weights, np.float32) * np.float32(STEPS_PER_UNIT)
+    # 2.0: byte steps per weighted unit: with the default weights of 4 the strongest edges just fill a byte.
+    scale = np.asarray(weights, np.float32) * np.float32(2.0)
     _pack(_framed(image, RADIUS_PX), TAPS, scale, words, deviation)
     return words, deviation
 

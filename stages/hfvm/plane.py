@@ -48,25 +48,10 @@ MIN_MATCHES = 60
 KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
-MIN_EXPLAINED_SHARE = 0.6
-"""Least share of the coarse matches that the plane must explain; a street's ground has .44 to .55."""
-
-MIN_EXPLAINED_OF_FEW = 0.5
-"""The same where windows are so sheared that few match, and of these the ground the least."""
-
-MIN_DISTORTION = 0.2
-"""Shear or stretch, pixels per pixel, from which on images are aligned."""
-
-MAX_DISTORTION = 3.0
-"""Shear or stretch, pixels per pixel, from which on the plane is no ground but a bad fit; views turned by 180 degrees
-have 2, and more if scaled."""
 
 PLANE_TOLERANCE_PX = 1.0
 """Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
 weight."""
-
-MARGIN_WIDTH_SHARE = 1.0 / 16.0
-"""Share of the width added around the aligned image, for what stands out of the plane."""
 
 
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
@@ -75,11 +60,16 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
     fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
-    if fit is None or fit[1] < (MIN_EXPLAINED_OF_FEW if few else MIN_EXPLAINED_SHARE):
+    # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
+    # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
+    if fit is None or fit[1] < (0.5 if few else 0.6):
         return None
     h = to_level_0(fit[0], level)
     shear = distortion(h, (shapes[0][0], shapes[0][1]))
-    return h if MIN_DISTORTION <= shear < MAX_DISTORTION else None
+    # 0.2: shear or stretch, pixels per pixel, from which on images are aligned.
+    # 3.0: shear or stretch, pixels per pixel, from which on the plane is no ground but a bad fit; views turned by 180
+    # degrees have 2, and more if scaled.
+    return h if 0.2 <= shear < 3.0 else None
 
 
 def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
@@ -160,7 +150,8 @@ def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
 
 def margin(left_shape: tuple[int, ...]) -> int:
     """Pixels added on every side of the aligned image: whole ones of the sixth level, too."""
-    return int(np.ceil(MARGIN_WIDTH_SHARE * left_shape[1] / 32.0)) * 32
+    # A sixteenth of the width is added around the aligned image, for what stands out of the plane.
+    return int(np.ceil(left_shape[1] / 16.0 / 32.0)) * 32
 
 
 def translation(x: float, y: float | None = None) -> Matrix:
@@ -285,9 +276,6 @@ MIN_CONTRAST = 0.02
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
 
-MIN_AGREEING_SHARE = 0.2
-"""Share of the unambiguous keypoints that must agree."""
-
 
 def find_turn(left: Image, right: Image) -> Matrix | None:
     """Homography from left to right pixels (level 0) on which enough keypoints agree, or None."""
@@ -299,11 +287,8 @@ def find_turn(left: Image, right: Image) -> Matrix | None:
     # What relief does to a keypoint's place on the dominant surface.
     limit = 0.01 * max(right.shapes[levels[1]])
     h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
-    if (
-        h is None
-        or agree.sum() < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(first))
-        or not _upright(h, left.shapes[levels[0]])
-    ):
+    # 0.2: share of the unambiguous keypoints that must agree.
+    if h is None or agree.sum() < max(MIN_AGREEING, 0.2 * len(first)) or not _upright(h, left.shapes[levels[0]]):
         return None
     # Images of unlike size are looked at on levels of their own, so each side has its own scale.
     return np.asarray(finer(levels[1]) @ h @ np.linalg.inv(finer(levels[0])), dtype=np.float64)

@@ -312,20 +312,10 @@ def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-d
 MEAN_SIDE_PX = 9
 """Pixels: window of the local mean; brightness varies more slowly."""
 
-HALVING_RESIDUAL_GREY = 10.0
-"""Grey levels: residual that halves a pixel's weight, well above camera noise."""
-
-LINE_STIFFNESS = 1000.0
-"""Squared grey levels for a pixel off the line: more than the strongest texture says."""
-
-TRUSTED_SPREAD_PX = 0.05
-"""Pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square."""
 
 BENT_SIDE_PX = 65
 """Pixels: side of a neighbourhood whose matches lie off their lines to one side where lenses bend the lines."""
 
-MAX_BENT_PX = 0.1
-"""Pixels: median of those means up to which the lines are trusted; noise has .02."""
 
 MAX_FIT_MATCHES = 4000
 
@@ -356,7 +346,8 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
     start_u, start_v = u, v
     u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
     lines, trust = _lines(u, v, keep, images.spline.shape)
-    holds = lines * np.float32(np.sqrt(LINE_STIFFNESS * trust))
+    # 1000.0 squared grey levels for a pixel off the line: more than the strongest texture says.
+    holds = lines * np.float32(np.sqrt(1000.0 * trust))
     for step in range(RELIEF_STEPS):
         soft = step < RELIEF_STEPS // 2
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
@@ -381,7 +372,8 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
     for _ in range(3):
         # Windows with less than a tenth of a pixel's weight have no pixel that takes part.
         mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), 0.1)
-        weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / HALVING_RESIDUAL_GREY)) ** 2)
+        # 10.0 grey levels: residual that halves a pixel's weight, well above camera noise.
+        weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / 10.0)) ** 2)
     planes[0] = weight
     planes[3] -= mean
     return planes
@@ -399,8 +391,10 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
     off = np.where(keep, off, np.float32(0))
     bent = (window_sum32(off, BENT_SIDE_PX) / np.maximum(window_count(keep, BENT_SIDE_PX), 1))[y, x]
-    trust = min(1.0, (TRUSTED_SPREAD_PX / max(fit[1], 1e-9)) ** 2)
-    return lines, trust if epipolar.typical(bent) <= MAX_BENT_PX else 0.0
+    # 0.05 pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square.
+    trust = min(1.0, (0.05 / max(fit[1], 1e-9)) ** 2)
+    # 0.1 pixels: median of those means up to which the lines are trusted; noise has .02.
+    return lines, trust if epipolar.typical(bent) <= 0.1 else 0.0
 
 
 def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:

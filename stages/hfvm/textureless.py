@@ -201,8 +201,6 @@ def _judge(region, so_far, found):  # type: ignore[no-untyped-def]
 REGION_LEVEL = 1
 """Halving once halves noise, and a quarter of the pixels is to be searched."""
 
-MAX_DEVIATION_GREY = 1.0
-"""Grey levels of local deviation below which a pixel of the level may belong to a region."""
 
 MIN_REGION_PX = 6 * WINDOW_SIDE_PX * WINDOW_SIDE_PX
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
@@ -220,13 +218,6 @@ MAX_SLOPE = MAX_VOTE_DISTANCE_PX / WINDOW_RADIUS_PX
 MIN_VOTING_SHARE = 0.45
 """Share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations but noise; a
 wall of Monopoly that is largely hidden at most .39, and where blocks of a JPEG image of Lampshade1 agree .44."""
-
-MIN_CHANCE_SIGMAS = 6.0
-"""Standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of three
-corners there are some 10^5 different planes, and the best one is taken."""
-
-ALIKE_QUANTILE = 0.95
-"""Share of the agreeing windows that speak no more against the plane than a window may whose pixel is matched."""
 
 
 class Planes(NamedTuple):
@@ -274,7 +265,8 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
     unmatched = np.ones((2 * left.shape[0], 2 * left.shape[1]), bool)
     np.not_equal(matches["validity"], 0, out=unmatched[whole(matches["validity"].shape).slices])
     weak = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
-    for window, inside in _regions(weak & (left.deviation < MAX_DEVIATION_GREY) & (left.valid != 0)):
+    # 1.0: grey levels of local deviation below which a pixel of the level may belong to a region.
+    for window, inside in _regions(weak & (left.deviation < 1.0) & (left.valid != 0)):
         x0, y0 = window.x0, window.y0
         lines = epipolar.lines(epipolar.moved(coarse, (x0, y0), (x0, y0)), inside.shape)
         words = np.ascontiguousarray(left.words[window.slices])
@@ -296,7 +288,9 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
         agree = (error <= MAX_AGREE_DISTANCE_PX) & inner & np.isfinite(more[y, x])
         if _sure(agree, votes, found.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
-            alike = more <= np.quantile(more[y[agree], x[agree]], ALIKE_QUANTILE)
+            # 0.95: share of the agreeing windows that speak no more against the plane than a window may whose pixel is
+            # matched.
+            alike = more <= np.quantile(more[y[agree], x[agree]], 0.95)
             # What has another match of its own is not of this plane.
             label[window.slices][inside & ~(usable & found.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
@@ -309,7 +303,9 @@ def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
     # Windows that do not overlap and are equally distinct would have to be as many to tell as much.
     windows = votes.sum() ** 2 / np.sum(votes**2) / WINDOW_SIDE_PX**2
     spread = np.sqrt(chance * (1 - chance) / windows)
-    return bool(np.average(agree, weights=votes) >= chance + MIN_CHANCE_SIGMAS * spread)
+    # 6.0: standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of
+    # three corners there are some 10^5 different planes, and the best one is taken.
+    return bool(np.average(agree, weights=votes) >= chance + 6.0 * spread)
 
 
 def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:

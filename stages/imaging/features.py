@@ -32,10 +32,6 @@ MAX_FEATURES, MAX_IMAGE_SIDE = 1300, 1400
 MAX_DOUBLED_PIXELS = 150_000
 """Pixels up to which an image is not halved: of a street at 320 x 96, all of 29 frames have a pose so, 8 otherwise."""
 
-MIN_CONTRAST, FIRST_SCALE = 0.02, 1.3
-"""Of a keypoint, as OpenCV counts (COLMAP's); and the scale of the first octave, px, of a doubled image. OpenCV's own
-1.6 finds fewer of the small features, which are the most exact: errors on the short mockup are a third larger."""
-
 
 def grey_bytes(image: NDArray[Any]) -> Bytes:
     """Image (row, col) as uint8: uint16 is divided by 257, floats of 0..255 are rounded."""
@@ -65,7 +61,9 @@ def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
     if halving == 2:
         # Smoothed by the blur that SIFT assumes; area means would leave aliases, and errors a tenth larger.
         grey = cv2.pyrDown(grey)
-    sift = cv2.SIFT.create(MAX_FEATURES, 3, MIN_CONTRAST, sigma=FIRST_SCALE, enable_precise_upscale=True)
+    # COLMAP's contrast of a keypoint, as OpenCV counts. OpenCV's own scale of the first octave, 1.6 px of a doubled
+    # image, finds fewer of the small features, which are the most exact: errors on the short mockup are a third larger.
+    sift = cv2.SIFT.create(MAX_FEATURES, 3, 0.02, sigma=1.3, enable_precise_upscale=True)
     keypoints, values = sift.detectAndCompute(grey, None)
     if not keypoints:
         return Bundle({"points": np.zeros((0, 2), np.float32), "descriptors": np.zeros((0, 128), np.uint8)}, {})

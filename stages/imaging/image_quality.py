@@ -22,8 +22,6 @@ from rille.stages.imaging.pyramid import grey
 MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
 
-STRIP_HEIGHTS = (0.25, 0.5, 0.75)
-"""Of the height: where the strips lie whose sharpness stands for the image's."""
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
 
@@ -58,8 +56,9 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels.
     """
     rows = image.shape[0]
+    # (0.25, 0.5, 0.75): of the height: where the strips lie whose sharpness stands for the image's.
     first = sorted(
-        {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in STRIP_HEIGHTS}
+        {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in (0.25, 0.5, 0.75)}
     )
     textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
     sharp = [s for s, _ in textures if math.isfinite(s)]

@@ -13,11 +13,6 @@ Levels = tuple[int, int]
 """Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped."""
 
 WHITE = 65535
-MAX_SPAN_SHARE = 1 / 8
-"""Share of the range, from dark to bright, up to which samples are spread."""
-
-MAX_TOP_SHARE = 1 / 4
-"""Share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits."""
 
 
 OUTLYING = (0.5, 99.5)
@@ -36,7 +31,9 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
         int(f(np.percentile(image, q) for image in deep)) for f, q in zip((min, max), OUTLYING, strict=True)
     )
     span, top = max(bright - dark, 1), max(int(image.max()) for image in deep)
-    if span > MAX_SPAN_SHARE * WHITE and top > MAX_TOP_SHARE * WHITE:
+    # 1 / 8: share of the range, from dark to bright, up to which samples are spread.
+    # 1 / 4: share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits.
+    if span > 1 / 8 * WHITE and top > 1 / 4 * WHITE:
         return None
     gain = 1 << (WHITE // (2 * span)).bit_length() - 1
     # Their middle becomes that of the range, but black stays black.

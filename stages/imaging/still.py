@@ -22,10 +22,6 @@ from rille.stages.imaging.pyramid import grey
 WINDOW_SIDE_PX = 15
 """Pixels: side of the windows."""
 
-MIN_KEPT_VARIANCE_SHARE = 0.75
-"""Share of the variance that is kept on a still part. In eleven frames of a street with a bonnet: 1 on it, and above
-this on a tenth of the street, its sky; in twenty of a street without: .64 at most; in ten of a rover: above it on a sky
-that grows dark upwards."""
 
 MIN_IMAGES = 5
 """Images: of fewer the mean keeps too much of any scene."""
@@ -37,7 +33,10 @@ def still(images: Sequence[AnyArray]) -> Bools:
     share = _variance(evened.mean(axis=0)) / np.maximum(np.mean([_variance(image) for image in evened], axis=0), 1e-9)
     # What has no texture between still parts belongs to them, thin still things do not.
     window = np.ones((WINDOW_SIDE_PX, WINDOW_SIDE_PX), np.uint8)
-    parts = (share > MIN_KEPT_VARIANCE_SHARE).view(np.uint8)
+    # 0.75: share of the variance that is kept on a still part. In eleven frames of a street with a bonnet: 1 on it, and
+    # above this on a tenth of the street, its sky; in twenty of a street without: .64 at most; in ten of a rover: above
+    # it on a sky that grows dark upwards.
+    parts = (share > 0.75).view(np.uint8)
     for operation in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):
         parts = cv2.morphologyEx(parts, operation, window)
     number, label = cv2.connectedComponents(parts, connectivity=4)

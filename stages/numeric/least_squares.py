@@ -6,14 +6,11 @@ Sources: Marquardt (1963), doi:10.1137/0111030; Holland and Welsch (1977), doi:1
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-
-FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
-"""Marquardt's factor at the start, and that from which on no step is expected to lower the cost any more."""
 
 
 class Equations(Protocol):
@@ -23,6 +20,14 @@ class Equations(Protocol):
     def cost(self) -> float:
         """Half the weighted sum of squares, or what stands in its place."""
         ...
+
+
+class NormalEquations(NamedTuple):
+    """Gauss-Newton matrix (n, n), dense or sparse, and gradient (n,) at a state, and its cost."""
+
+    matrix: Any
+    gradient: Floats
+    cost: float
 
 
 X = TypeVar("X")
@@ -52,10 +57,11 @@ class Minimum(NamedTuple, Generic[X]):
 
 def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, tolerance: float = 1e-9) -> Minimum[X]:
     """Minimum from ``state``; never worse than the start. Ends where a step lowers the cost by ``tolerance`` of it."""
-    damping, steps, finished = FIRST_DAMPING, 0, False
+    damping, steps, finished = 1e-4, 0, False
     now = problem.normal(state)
     first = now.cost
-    while steps < iterations and not finished and damping <= MAX_DAMPING:
+    # With more damping no step is expected to lower the cost any more.
+    while steps < iterations and not finished and damping <= 1e8:
         ahead = problem.ahead(state, now, damping)
         then = problem.normal(ahead)
         # Also of a refused step: at the minimum it changes the cost by rounding alone.

@@ -11,7 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
-from rille.stages.core.declare import AnyArray
+from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.validity import Mask
+from rille.stages.facts.odometry import MotionFacts
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
@@ -101,22 +103,34 @@ def common_similarity(origin: Floats, moved: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class LevelDisplacements:
-    """Coarse displacements (rows, cols) of a pyramid level, in level 0 pixels, NaN undefined."""
+class Motion:
+    """Displacements of the grid of pyramid level ``level`` of frame a, in pixels of **level 0**.
 
-    column: Floats32
-    row: Floats32
+    Grid pixel (row, col) stands for level-0 position ``(col + 0.5) * 2**level - 0.5`` (rows likewise). All arrays are
+    (row, col): ``column_disparity, row_disparity`` float32, b minus a, NaN undefined, interpolated ones
+    included; ``validity`` bits of :class:`~rille.stages.core.validity.Validity`.
+    """
+
     level: int
+    column_disparity: Floats32
+    row_disparity: Floats32
+    validity: Mask
+
+    @staticmethod
+    def of(bundle: Bundle[MotionFacts]) -> Motion:
+        """Result of stage ``motion``."""
+        names = "column_disparity", "row_disparity", "validity"
+        return Motion(bundle.meta["level"], *(np.asarray(bundle[name]) for name in names))
 
     def at(self, points: Floats) -> Floats:
         """Displacement (n, 2) at points (n, 2), pixels: median of the defined ones among 3 x 3; NaN none."""
         k = 0.5**self.level
-        rows, cols = self.column.shape
+        rows, cols = self.validity.shape
         # Pixel of the coarse level that holds the point: edges lie half a pixel before the centres.
         centre = np.floor((np.nan_to_num(points) + 0.5) * k).astype(np.intp)
         dy, dx = (o.ravel() for o in np.mgrid[-1:2, -1:2])
         y, x = np.clip(centre[:, 1:] + dy, 0, rows - 1), np.clip(centre[:, :1] + dx, 0, cols - 1)
-        both = np.stack([self.column[y, x], self.row[y, x]], -1).astype(np.float64)
+        both = np.stack([self.column_disparity[y, x], self.row_disparity[y, x]], -1).astype(np.float64)
         there = np.asarray(np.isfinite(both).all(axis=-1))
         count = there.sum(axis=1)
         both = np.where(there[..., None], both, np.nan)

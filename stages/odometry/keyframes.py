@@ -21,9 +21,6 @@ from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.odometry import KeyframesFacts, StepTableFacts
 from rille.stages.odometry.steps import Step, overlaps, steps_of
 
-LITTLE = 0.4
-"""Overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image."""
-
 NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
 """What preset ``navigation`` sets; a value given by the user wins."""
 
@@ -149,7 +146,8 @@ def _warnings(
             " overlap there is not known, and the frames are tracked on a poor prediction"
         )
     least, at = min(((v, k) for k, v in enumerate(overlap) if v is not None), default=(1.0, 0))
-    wanted = params.overlap if params.rule == "overlap" else LITTLE
+    # 0.4: overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image.
+    wanted = params.overlap if params.rule == "overlap" else 0.4
     if least < wanted:
         lines.append(
             f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted: "

@@ -11,14 +11,12 @@ degrees a third of the tracks is wrong. The displacements are those of the frame
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
 
-from rille.stages.core.arrays import Floats32
-from rille.stages.core.declare import AnyArray, Bundle, Params, raster, stage
-from rille.stages.core.validity import Mask, Validity, defined, mark, matched, matched_share
+from rille.stages.core.declare import Bundle, Params, raster, stage
+from rille.stages.core.validity import Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
 from rille.stages.hfvm import plane
@@ -29,7 +27,7 @@ from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.displacements import common_similarity
+from rille.stages.odometry.displacements import Motion, common_similarity
 
 
 class MotionParams(Params):
@@ -56,26 +54,9 @@ class MotionParams(Params):
     )
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Displacements of the grid of pyramid level ``level`` of frame a, in pixels of **level 0**.
-
-    Grid pixel (row, col) stands for level-0 position ``(col + 0.5) * 2**level - 0.5`` (rows likewise). All arrays are
-    (row, col): ``column_disparity, row_disparity`` float32, b minus a, NaN undefined, interpolated ones
-    included; ``validity`` bits of :class:`~rille.stages.core.validity.Validity`.
-    """
-
-    level: int
-    column_disparity: Floats32
-    row_disparity: Floats32
-    validity: Mask
-
-
 SMOOTHNESS, ROUNDS = 5, 6
 """Cost [feature byte steps] of a displacement difference of one pixel to each neighbour; and propagation rounds at each
 pyramid level, of which more change little."""
-MIN_ROLL_DEG = 10.0
-"""Rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks are wrong."""
 MIN_TEXTURED = 100
 """Pixels with texture, at the coarse level, from which on a rotation can show."""
 
@@ -137,7 +118,9 @@ def _turned(a: Pyramid, b: Pyramid, plain: Motion, params: MotionParams) -> Moti
     share, needed = matched_share(plain.validity), 1.2
     if share >= params.turn_below:
         # Small rotations are the matcher's, which stands them: resampling the image costs more than they do.
-        if abs(_roll_deg(plain)) < MIN_ROLL_DEG:
+        # 10.0: rotation of the image below which nothing is undone: up to there, one to three per cent of the tracks
+        # are wrong.
+        if abs(_roll_deg(plain)) < 10.0:
             return None
         needed = 1.0
     turn = plane.find_turn(as_matched(a, HfvmParams()), as_matched(b, HfvmParams()))
@@ -190,9 +173,4 @@ def motion_stage(params: MotionParams, a: Bundle[PyramidFacts], b: Bundle[Pyrami
         "overlap": int(np.count_nonzero(seen)) / usable if usable else None,
         "turn_found_deg": 0.0 if turned is None else _roll_deg(turned),
     }
-    arrays: dict[str, AnyArray] = {
-        "column_disparity": found.column_disparity,
-        "row_disparity": found.row_disparity,
-        "validity": found.validity,
-    }
-    return Bundle(arrays, meta)
+    return Bundle({name: values for name, values in vars(found).items() if name != "level"}, meta)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import cross_matrix, rotation_exp, rotation_log
-from rille.stages.numeric.least_squares import levenberg_marquardt
+from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
 EXCESS = (1.0, 2.0, 5.0, 10.0, 30.0)
 """Factors k that are tried: on recorded sequences errors were up to 30 times those stated."""
@@ -63,7 +63,8 @@ class Factors:
         lever: Floats | None = None,
     ) -> Factors:
         """Factors that measure so many ``components`` and are doubted; 0: they are not doubted."""
-        bound = np.full(len(ends), bound_of(components) if components else np.inf)
+        # One in a hundred true factors has a longer whitened error.
+        bound = np.full(len(ends), scipy.special.chdtri(components, 0.01) if components else np.inf)
         shared = np.zeros((len(ends), 6, 0)) if shared is None else shared
         return Factors(ends, poses, root, shared, np.zeros((len(ends), 3)) if lever is None else lever, bound)
 
@@ -100,11 +101,6 @@ def root_of(covariance: Floats) -> Floats:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(unit)) / sigma[..., None, :])
 
 
-def bound_of(components: int) -> float:
-    """Squared length of the whitened error of so many components that one in a hundred true factors exceeds."""
-    return float(scipy.special.chdtri(components, 0.01))
-
-
 class GraphState(NamedTuple):
     """Poses (n, 3, 3) and positions (n, 3), m, of the nodes, and the sources (q,) in standard deviations."""
 
@@ -121,14 +117,6 @@ class GraphState(NamedTuple):
     def poses(self) -> Floats:
         """Poses (n, 3, 4)."""
         return np.concatenate([self.R, self.C[:, :, None]], axis=2)
-
-
-class GraphEquations(NamedTuple):
-    """Normal equations of a graph at a state."""
-
-    cost: float
-    matrix: scipy.sparse.csc_array
-    gradient: Floats
 
 
 @dataclass(frozen=True)
@@ -181,7 +169,7 @@ class PoseGraph:
         rotation = rotation_log(back @ state.R[b] @ np.swapaxes(f.poses[:, :, :3], 1, 2))
         return np.concatenate([position, rotation], axis=1), way, lever
 
-    def normal(self, state: GraphState) -> GraphEquations:
+    def normal(self, state: GraphState) -> NormalEquations:
         """Normal equations of the weighted factors and of the sources' own information."""
         f, (off, way, lever) = self.factors, self._difference(state)
         root = self._scale[:, None, None] * f.root
@@ -205,9 +193,9 @@ class PoseGraph:
         gradient = J.T @ white.reshape(-1)
         gradient[sources] += self._prior * state.sources
         cost = 0.5 * float((white**2).sum() + (self._prior * state.sources**2).sum())
-        return GraphEquations(cost, scipy.sparse.csc_array(J.T @ J + scipy.sparse.diags_array(own)), gradient)
+        return NormalEquations(scipy.sparse.csc_array(J.T @ J + scipy.sparse.diags_array(own)), gradient, cost)
 
-    def ahead(self, state: GraphState, normal: GraphEquations, damping: float) -> GraphState:
+    def ahead(self, state: GraphState, normal: NormalEquations, damping: float) -> GraphState:
         """State after one step, the diagonal enlarged by ``damping`` times itself."""
         damped = normal.matrix + scipy.sparse.diags_array(damping * normal.matrix.diagonal())
         step = -_factorised(damped).solve(normal.gradient)

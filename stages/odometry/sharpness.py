@@ -16,9 +16,8 @@ from rille.stages.odometry.displacements import windows_at
 NOTABLE = 0.6
 """Share of squared gradients from which on images count as equally sharp: a blur of half a pixel leaves .7."""
 
-LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 STEP = 1.2
-"""Standard deviations that are tried, and their ratio: four fifths of the right one serve the alignment as well."""
+"""Ratio of the blurs that are tried: four fifths of the right one serve the alignment as well."""
 
 
 def equally_sharp(a: Floats32, b: Floats32, in_a: Floats, in_b: Floats) -> tuple[Floats32, Floats32] | None:
@@ -39,8 +38,8 @@ def equally_sharp(a: Floats32, b: Floats32, in_a: Floats, in_b: Floats) -> tuple
 
 def _blurred(image: Floats32, points: Floats, wanted: float) -> Floats32:
     """The image with the widest blur that leaves the squared gradients that are wanted."""
-    blurred, sigma = image, LEAST_BLUR_PX
-    while sigma <= MOST_BLUR_PX:
+    blurred, sigma = image, 0.5
+    while sigma <= 8.0:
         wider = cv2.GaussianBlur(image, (0, 0), sigma)
         if _gradients(wider, points) < wanted:
             break

@@ -29,21 +29,16 @@ from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, TrackFacts
 from rille.stages.imaging.pyramid import Pyramid
 from rille.stages.odometry.affine_lk import HALF, Templates, align
-from rille.stages.odometry.displacements import NEIGHBOURS, LevelDisplacements, fit_affinity, known
+from rille.stages.odometry.displacements import NEIGHBOURS, Motion, fit_affinity, known
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.sharpness import equally_sharp
 
 BORDER = 8
 """Pixels between an interest point and the image's edge: template, cubic interpolation and a step of the alignment."""
 
-REACH_PX = 4.0
-"""Largest distance of a point from its prediction: one pixel of the coarse displacement map."""
 
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
-
-AFFINITY_SIGMA = 0.1
-"""Standard deviation of each element of a template's affinity about the one fitted to its neighbours."""
 
 
 class TrackParams(Params):
@@ -84,7 +79,7 @@ class Tracks:
         return Tracks(*(np.concatenate([mine, vars(other)[name][keep]]) for name, mine in vars(self).items()))
 
 
-def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], params: TrackParams) -> Tracks:
+def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackParams) -> Tracks:
     """Follow interest points of the first frame, and later ones, through all frames.
 
     Parameters
@@ -102,7 +97,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[LevelDisplacements], para
     return state
 
 
-def _advance(state: Tracks, frames: Sequence[Pyramid], motion: LevelDisplacements, j: int, params: TrackParams) -> None:
+def _advance(state: Tracks, frames: Sequence[Pyramid], motion: Motion, j: int, params: TrackParams) -> None:
     """Find all points of frame j - 1 in frame j; a lost one goes on with its prediction, and may be found again."""
     state.expected = state.expected + motion.at(state.expected)
     inside = known(state.expected)
@@ -147,7 +142,9 @@ def _aligned(a: Pyramid, b: Pyramid, templates: Templates, params: TrackParams) 
 def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates, params: TrackParams) -> Floats:
     """Positions (n, 2) in ``b`` of points of ``a`` whose alignment back ends where they are; NaN of the others."""
     # A difference of two images has the noise of both.
-    how = {"noise": params.noise * 2.0**0.5, "spread": AFFINITY_SIGMA, "reach": REACH_PX}
+    # 4.0: largest distance of a point from its prediction: one pixel of the coarse displacement map.
+    # 0.1: standard deviation of each element of a template's affinity about the one fitted to its neighbours.
+    how = {"noise": params.noise * 2.0**0.5, "spread": 0.1, "reach": 4.0}
     place = align(a, b, templates, **how)
     good = np.flatnonzero(clear_of_mask(valid, place, HALF))
     inverse = np.asarray(np.linalg.inv(templates.affinity[good]), np.float64)
@@ -170,9 +167,5 @@ def track_stage(
     frames: Sequence[int],
 ) -> Bundle[TrackFacts]:
     """Interest points followed through the left frames of a segment."""
-    moves = [
-        LevelDisplacements(np.asarray(b["column_disparity"]), np.asarray(b["row_disparity"]), b.meta["level"])
-        for b in motions
-    ]
-    found = track([Pyramid.from_bundle(b) for b in pyramids], moves, params)
+    found = track([Pyramid.from_bundle(b) for b in pyramids], [Motion.of(b) for b in motions], params)
     return Bundle({"points": found.points.astype(np.float32)}, {"frames": list(frames)})

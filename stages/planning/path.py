@@ -45,7 +45,16 @@ from rille.stages.hazard.measures import MEASURES
 from rille.stages.hazard.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN, check_size
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
-from rille.stages.planning.path_ground import COST_UNIT_M, GROUNDS, Maps, PathMaps, PathParams, Point, cell_of
+from rille.stages.planning.path_ground import (
+    COST_UNIT_M,
+    GROUNDS,
+    Maps,
+    PathMaps,
+    PathParams,
+    Point,
+    cell_of,
+    cell_within,
+)
 from rille.stages.planning.row_graph import UNREACHED, Cell, Ints, sweep, trace
 
 
@@ -290,15 +299,8 @@ def _grounds(ground: PathMaps, ends: Cells, behind: int, *, by_rows: bool) -> It
 
 def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
     """Refuse a start or target outside the map, in a hazard or on unknown ground, with the figure that decides."""
-    row, col = cell_of(lattice, point)
+    row, col = cell_within(lattice, f"path.{name}", point)
     where = f"path.{name} ({point[0]:g}, {point[1]:g}) m"
-    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
-        x0, x1, y0, y1 = lattice.bounds
-        raise InputError(
-            "RIL-406",
-            f"{where} is outside the map",
-            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
-        )
     kind = maps["risk"][row, col]
     if kind == UNKNOWN:
         free, away = np.argwhere(maps["risk"] < HAZARDOUS), ""

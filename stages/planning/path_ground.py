@@ -12,6 +12,7 @@ from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Bytes, Floats
 from rille.stages.core.declare import Params
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
 from rille.stages.hazard.risk import CAUTION, HAZARDOUS, UNKNOWN, window_cells
@@ -80,6 +81,19 @@ class PathParams(Params):
 def cell_of(lattice: Lattice, point: Sequence[float] | Floats) -> Cell:
     """Row and column of the cell that holds a point x, y, m; they may lie outside of the lattice."""
     row, col = np.rint(lattice.index(point)).astype(np.int64).tolist()
+    return row, col
+
+
+def cell_within(lattice: Lattice, name: str, point: Sequence[float]) -> Cell:
+    """The same of a point called ``name``, which is refused outside of the lattice."""
+    row, col = cell_of(lattice, point)
+    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
+        x0, x1, y0, y1 = lattice.bounds
+        raise InputError(
+            "RIL-406",
+            f"{name} ({point[0]:g}, {point[1]:g}) m is outside the map",
+            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
+        )
     return row, col
 
 

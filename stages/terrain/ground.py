@@ -85,7 +85,8 @@ def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPla
             remedy="check exposure and focus, and that left and right show one scene",
         )
     # dh of height changes 1/Z by the share dh/h.
-    tolerance = np.sqrt((2.0 * sigma) ** 2 + (MAX_RELIEF_SHARE * rho) ** 2)
+    # Ground lies within 0.02 of the camera's height of the plane.
+    tolerance = np.sqrt((2.0 * sigma) ** 2 + (0.02 * rho) ** 2)
     theta = _consensus(samples, tolerance, allowed)
     if theta is not None:
         # Tukey's weight of the residual over twice the tolerance, on that of the observation.
@@ -95,15 +96,14 @@ def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPla
         on = (expected > MIN_HORIZON_SIGMAS * sigma) & (np.abs(rho - expected) < tolerance)
         # theta = -n / h: its length is one over the height.
         share, length = float(np.mean(on)), float(np.linalg.norm(theta))
-        if share >= MIN_GROUND_SHARE and bool(allowed(-theta[None] / length)[0]):
+        # 0.05: ground is a plane that at least so many of the pixels below the horizon lie on.
+        if share >= 0.05 and bool(allowed(-theta[None] / length)[0]):
             reach = length * float(np.quantile(np.linalg.norm(rays[on], axis=1) / expected[on], 0.9))
             return GroundPlane(-theta / length, 1.0 / length, share, reach)
     raise NoGroundError("RIL-343", "the disparity shows no ground plane below the camera")
 
 
 MIN_POINTS = 100
-MIN_GROUND_SHARE = 0.05
-MAX_RELIEF_SHARE = 0.02  # largest distance of ground from the plane, of the camera's height
 MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with any plane, and is not counted
 
 

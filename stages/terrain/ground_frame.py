@@ -51,7 +51,6 @@ SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
 
 MAX_TILT_DEG = 30.0  # largest slope of the ground, and largest roll of an unknown attitude
-MIN_PITCH_DEG, MAX_PITCH_DEG = -20.0, 75.0  # downward pitch of a rig whose attitude is unknown
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
@@ -298,7 +297,8 @@ def _allowed(normals: Floats, vertical: Floats | None) -> Bools:
         return np.asarray(normals @ vertical >= math.cos(tilt))
     pitch = np.degrees(np.arctan2(-normals[:, 2], -normals[:, 1]))
     level_enough = np.abs(normals[:, 0]) <= math.sin(tilt)
-    return np.asarray(level_enough & (pitch >= MIN_PITCH_DEG) & (pitch <= MAX_PITCH_DEG))
+    # Degrees: downward pitch of a rig whose attitude is unknown.
+    return np.asarray(level_enough & (pitch >= -20.0) & (pitch <= 75.0))
 
 
 def _local_plane(ground: GroundPlane, R_local_left: Floats) -> list[float]:

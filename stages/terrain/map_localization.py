@@ -47,8 +47,6 @@ MAX_TRIES, MAX_TRIES_AT_ALL = 3e6, 2e8
 """Headings times cells: above, a coarser version is searched where there is one; and what is refused."""
 NEIGHBOURS = 3
 """Steps of the search, within which a place is a neighbour: it belongs to the same valley."""
-MORE_TURN = math.radians(20.0)
-"""By which the search turns farther than the answer may; it reaches farther by the radius of the model."""
 MIN_CHI2_GAP = 30.0
 """Difference of chi2 to the second best place, below which the answer is ambiguous. Stops of the mockup on seeds 1 to 3
 had 148 at least at their right places, 7 at most in the map of another bed; on seeds 4 to 8 64 and 30."""
@@ -160,7 +158,9 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
             remedy="give a finer map, or a model of more ground",
         )
     middle, far = blocks.points.mean(axis=0), blocks.radius
-    wide = replace(around, distance=around.distance + far, turn=min(around.turn + MORE_TURN, math.pi))
+    # 20 degrees: by which the search turns farther than the answer may; it reaches farther by the radius of the
+    # model.
+    wide = replace(around, distance=around.distance + far, turn=min(around.turn + math.radians(20.0), math.pi))
     ground = ground.within((wide.x, wide.y), wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
     coarse = ground
     # Fewer than a hundred cells tell too little.

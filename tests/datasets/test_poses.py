@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from rille.datasets.poses import TimedPoses, coverage, interpolate, read_poses, read_positions
+from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -21,7 +21,7 @@ H = "0.7071068"
 def read(tmp_path, text, **kwargs):
     path = tmp_path / "poses.txt"
     path.write_text(text)
-    return read_poses(path, **kwargs)
+    return poses_of(read_motion(path, kwargs.get("format", "auto")), **kwargs)
 
 
 @pytest.mark.parametrize(
@@ -227,13 +227,13 @@ def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_pat
 @pytest.mark.parametrize("names", ["secs,nsecs", "field.header.stamp.sec,field.header.stamp.nanosec"])
 def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path, names):
     (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,100000000,1,2\n1400000001,9000,1,3\n")
-    found = read_positions(tmp_path / "p.csv", "auto", {"time": names.partition(",")[0]})
+    found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {"time": names.partition(",")[0]})
     assert found is not None
     assert found.times == pytest.approx((1400000000.1, 1400000001.000009), abs=1e-6)
-    assert read_positions(tmp_path / "p.csv", "auto", {}) == found
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {}) == found
     (tmp_path / "p.csv").write_text(f"{names},x,y\n1400000000,1e8,1,2\n")
     with raises("RIL-291", "line 2", "1e8"):
-        read_positions(tmp_path / "p.csv", "auto", {})
+        positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
 
 
 @pytest.mark.parametrize("header", ["time,x,y,yaw_deg", "time,x,y,theta [deg]", "time,x,y,qx,qy,qz,qw"])
@@ -254,18 +254,18 @@ def test_positions_without_a_measured_coordinate_are_refused_and_without_heights
         (tmp_path / "p.csv").write_text(text)
         if row:
             with raises("RIL-284", row):
-                read_positions(tmp_path / "p.csv", "auto", {})
+                positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
         else:
-            assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
+            assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
 
 
 @pytest.mark.parametrize("name", ["{} [mm]", "{}_mm", "{} (mm)"])
 def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
     x, y = (name.format(axis) for axis in "xy")
     (tmp_path / "p.csv").write_text(f"time,{x},{y}\n1,2000,3000\n2,4000,5000\n")
-    assert read_positions(tmp_path / "p.csv", "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {}).positions == ((2.0, 3.0), (4.0, 5.0))
     # What a manifest states goes before what a name says.
-    assert read_positions(tmp_path / "p.csv", "auto", {}, 1.0).positions[0] == (2000.0, 3000.0)
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {}, 1.0).positions[0] == (2000.0, 3000.0)
     found = read(tmp_path, f"time,{x},{y},yaw_deg\n1,2000,3000,90\n")
     np.testing.assert_allclose(found.poses[0].translation, [2, 3, 0])
     np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
@@ -274,4 +274,4 @@ def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
 def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):
     (tmp_path / "p.csv").write_text("time,x_deg,y_deg\n1,15,47\n2,15,47\n")
     with raises("RIL-995", "x_deg"):
-        read_positions(tmp_path / "p.csv", "auto", {})
+        positions_of(read_motion(tmp_path / "p.csv"), "auto", {})

@@ -166,8 +166,7 @@ def test_a_damaged_output_is_drawn_again(cold: Path, capsys: pytest.CaptureFixtu
 def test_a_figure_that_cannot_be_drawn_is_missing(
     cold: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawing = gallery.Drawing("Pairs", lambda _: 1 / 0, lambda _: ())  # type: ignore[arg-type, return-value]
-    failed = FIGURE.dump_json(drawing.figure(None))
+    failed = FIGURE.dump_json(gallery.draw("Pairs", lambda _: 1 / 0, None))  # type: ignore[arg-type, return-value]
 
     def read(data: bytes) -> Figure:
         title = FIGURE.validate_json(data).title

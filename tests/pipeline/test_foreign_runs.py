@@ -25,9 +25,9 @@ from rille.pipeline.engine.runtime.hints import read_hint
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import unpack
-from rille.pipeline.export.programs import colmap, rocrate
+from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.programs.run_artifacts import export_run
-from rille.pipeline.export.read_dem import read_elevation
+from rille.pipeline.export.read_dem import frames_of, read_elevation
 from rille.stages.core.declare import Bundle
 
 ROW = '{"label": "a", "stage": "hfvm", "status": "computed", "key": "k", "seconds": 1, "kernel": 1, "digest": "d"}\n'
@@ -246,7 +246,7 @@ def test_a_pipe_in_a_run_is_not_waited_for(tmp_path: Path, name: str) -> None:
         read_elevation(folder)
     if name == "frames.json":
         with raises("RIL-138"):
-            colmap._names(folder)
+            frames_of(folder / name)
 
 
 @pytest.mark.parametrize("content", [DEEP, "{", "5", '{"georeference": 5}', '{"georeference": {"crs": "EPSG:32633"}}'])

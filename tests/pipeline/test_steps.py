@@ -154,8 +154,9 @@ def test_the_vehicle_may_be_a_file(dem: Any, tmp_path: Path) -> None:
 
 
 def test_settings_may_be_numbers_of_numpy(disparity: Any, pair: rille.StereoPair) -> None:
-    dem = rille.terrain(disparity, pair, cell_size=np.float32(0.0078125))
-    assert json.loads(dem.attrs["rille"])["settings"]["locus"]["cell_size"] == 0.0078125
+    dem = rille.terrain(disparity, pair, cell_size=np.float32(0.009))
+    # By its own digits, not those of the double that is nearest to its bits.
+    assert json.loads(dem.attrs["rille"])["settings"]["locus"]["cell_size"] == 0.009
     plane = [0.0, 0.0, -1.0, 0.0, 0.0, 0.5]
     one, other = (rille.terrain(disparity, pair, reference=given, cell_size=0.01) for given in (plane, np.array(plane)))
     np.testing.assert_array_equal(one.elevation, other.elevation)

@@ -27,18 +27,16 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
-from rille.pipeline.runs.session import memory_limit, settings, settings_of_run
+from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 
 MAX_REASONS = 3
 """Different reasons of a stage that are printed; ``verbose`` prints each task's."""
-
-_SETTINGS, _WORK = Settings(), Work()
 
 
 def plan(
     seq: str = "mockup",
     *,
-    options: Work = _WORK,
+    options: Work = Work(),
     verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
 ) -> int:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
@@ -51,17 +49,15 @@ def plan(
         Each task with its reason.
     """
     settled = settings_of_run(seq, options)
-    sequence, frames, config = settled.sequence, settled.frames, settled.config
-    graph, store = Graph(), Store(cache_folder(options.cache))
-    products, drive = dataflow(graph, sequence, config, frames)
+    graph, store, config = Graph(), Store(cache_folder(options.cache)), settled.config
+    products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
         from rille.pipeline.runs import run_files  # it imports matplotlib
 
         if graph.unfinished:  # not all of their inputs are known: they count among the tasks that follow
             return
-        taken = (sequence, frames) if drive is None else drive.taken()
-        run_files.plan(graph, RunView("", *taken, products, (), config, vehicle_source=settled.vehicle_source))
+        run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))
@@ -140,7 +136,7 @@ def _unknown(result: Result) -> Iterable[str]:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
 
 
-def graph(seq: str = "mockup", *, options: Settings = _SETTINGS) -> int:
+def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
     """Draw the stages of a run, the number of their tasks, and what each reads.
 
     What depends on results that are still to come is drawn as the last run had it; where there was none, the title says

@@ -12,10 +12,8 @@ from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
 
-_OPTIONS, _DRIVE = Options(), DriveOptions()
 
-
-def reconstruct(seq: str = "mockup", *more: str, options: Options = _OPTIONS) -> int:
+def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:
     """Reconstruct sequences; the same command again resumes, and recomputes only what changed.
 
     Of several a table says at the end what became of each; the exit code is that of the worst. One that cannot be
@@ -60,7 +58,7 @@ def _perform(seq: str, options: Options) -> tuple[int, Path]:
     return max(result.code, HOLES if unlike else COMPLETE), result.folder
 
 
-def drive(seq: str = "mockup-loop", *, options: DriveOptions = _DRIVE) -> int:
+def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -> int:
     """Drive a simulated rover to a goal in a closed loop: stop, map, plan, drive, localise, repeat.
 
     Prints how it ended (goal, no path, safety stop, stops, and why) and the folder of the report. What the rover does

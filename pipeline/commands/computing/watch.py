@@ -24,13 +24,8 @@ from rille.stages.core.errors import ConfigError, IncompleteError, InputError, R
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
 """Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
 
-GAP_SECONDS = 10.0
-"""Time for which a pair between others is waited for; then it counts as lost until it is there."""
 
-_OPTIONS = WatchOptions()
-
-
-def watch(seq: str, *, options: WatchOptions = _OPTIONS) -> int:
+def watch(seq: str, *, options: WatchOptions = WatchOptions()) -> int:
     """Reconstruct a sequence while its images arrive: trajectory, terrain, risk and path grow with it.
 
     The end is a whole run of all that has arrived, with the results of `rille reconstruct`, to the bit.
@@ -120,7 +115,8 @@ class _Watched:
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}
         self.gaps = {name: self.gaps.get(name, now) for name in names}
-        frames = min((names[n] for n, t in self.gaps.items() if now - t < GAP_SECONDS), default=sequence.frames)
+        # 10.0 seconds: time for which a pair between others is waited for; then it counts as lost until it is there.
+        frames = min((names[n] for n, t in self.gaps.items() if now - t < 10.0), default=sequence.frames)
         if frames < sequence.frames:
             self.say(f"rille: waiting: {sequence.lost[frames]}")
         images = [_image(sequence.image(k, c)) for k in range(frames) if k not in sequence.lost for c in CAMERAS]

@@ -123,15 +123,12 @@ def about(figures: Mapping[str, Any]) -> Iterator[str]:
         yield f"ortho        {figures['keypoints']} keypoints agree"
 
 
-_EVERYWHERE = Area()
-
-
 def localize(
     run: Run,
     dem: Path | None = None,
     *,
     ortho: Path | None = None,
-    area: Area = _EVERYWHERE,
+    area: Area = Area(),
     output: Annotated[Path, Output] = Path("localization"),
     runs: Runs = RUNS,
     cache: CacheFolder = None,

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.api import Run
-from rille.pipeline.export.read_dem import georeference_of, no_ground
+from rille.pipeline.export.read_dem import frames_of, georeference_in, no_ground
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
@@ -47,14 +45,14 @@ class Terrain:
         run, name = Run(folder), lookup.name(folder)
         terrain = run.terrain
         with lookup.reading(folder):
-            frames = json.loads(read_text(run.file("frames.json"), "frames.json", TABLE))["frames_of_reference"]
-            vertical = frames["world"].get("vertical", "")
+            frames = frames_of(run.file("frames.json"))
+            vertical = frames["frames_of_reference"]["world"].get("vertical", "")
             about = terrain.attrs
             rows, cols = terrain["elevation"].shape
             lattice = Lattice(float(terrain.x[0]), float(terrain.y[0]), float(about["cell_size_m"]), rows, cols)
             names = "elevation", "elevation_std", "ortho"
             elevation, sigma, ortho = (np.asarray(terrain[key], np.float64) for key in names)
-            place = georeference_of(folder)
+            place = georeference_in(frames)
         if vertical == REFERENCE_PLANE:
             raise no_ground(f"run {name}")
         if not np.isfinite(elevation).any():

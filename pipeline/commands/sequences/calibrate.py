@@ -28,11 +28,6 @@ from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigC
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
 
-MAX_CLUTTER = 0.1
-"""Residual over the spacing of the corners from which they are not those of a flat board: print errs by hundredths. It
-holds for any resolution and distance of the board."""
-
-
 Image = NDArray[Any]
 
 
@@ -179,7 +174,9 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     columns, rows = boards.corners
     grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
     spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    if rig.rms > MAX_CLUTTER * spacing:
+    # 0.1: residual over the spacing of the corners from which they are not those of a flat board: print errs by
+    # hundredths. It holds for any resolution and distance of the board.
+    if rig.rms > 0.1 * spacing:
         raise InputError(
             "RIL-800",
             f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS, "

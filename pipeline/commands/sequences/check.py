@@ -34,14 +34,7 @@ from rille.stages.imaging.image_quality import glance
 Steps = Generator[Wait, Any, None]
 
 
-MOTIONS, COMPARED_PAIRS = 12, 6
-"""Motions that are measured, and pairs whose rows are compared with those of shifted right images: all over the
-sequence, so that a fault of its second half is found as well."""
-
-_SETTINGS = Settings()
-
-
-def check(seq: str, *more: str, options: Settings = _SETTINGS) -> int:
+def check(seq: str, *more: str, options: Settings = Settings()) -> int:
     """Check sequences: open everything, match the first pair of each, and print one finding a line.
 
     Parameters
@@ -122,7 +115,7 @@ class Inspection:
         yield from self._first_pair(whole[0])
         yield from self._motions()
         if len(whole) > 1:
-            rows = yield self.make.synchrony("synchrony", spread(whole, COMPARED_PAIRS), whole)
+            rows = yield self.make.synchrony("synchrony", spread(whole, 6), whole)
             self.say(judge.judge_synchrony(rows.meta))
 
     def _images(self) -> Steps:
@@ -193,7 +186,8 @@ class Inspection:
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
-        chosen = spread(list(pairwise(self.frames)), MOTIONS)
+        # All over the sequence, as the pairs are whose rows are compared: a fault may lie in its second half.
+        chosen = spread(list(pairwise(self.frames)), 12)
         tasks = {(a, b): self.make.motion(a, b) for a, b in chosen if not {(a, "left"), (b, "left")} & self.broken}
         yield Maybe(list(tasks.values()))
         for task in tasks.values():

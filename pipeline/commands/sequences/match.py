@@ -80,15 +80,12 @@ class Matcher:
         return column, row
 
 
-_MATCHER = Matcher()
-
-
 def match(
     left: Path,
     right: Path,
     *,
     output: Annotated[Path, Output] = Path("disparity.tif"),
-    matcher: Matcher = _MATCHER,
+    matcher: Matcher = Matcher(),
     dense: Annotated[bool, FLAG] = False,
     confidence: Path | None = None,
 ) -> int:

@@ -17,7 +17,7 @@ from rille.datasets.text.count import count
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import georeference_of
+from rille.pipeline.export.read_dem import frames_of, georeference_in
 from rille.pipeline.export.writers import ENGINEERING_CRS
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
@@ -54,7 +54,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
     """
     from rasterio.crs import CRS
 
-    place, pairs = georeference_of(run.run), PlacedPairs(run, every)
+    place, pairs = georeference_in(frames_of(run.run / "frames.json")), PlacedPairs(run, every)
     # LAS 1.4 knows the first version of WKT alone.
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
     write = _write_laz if path.suffix.lower() == ".laz" else _write_ply

@@ -7,7 +7,6 @@ lens was undone the files on disk are not the model's.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
+from rille.pipeline.export.read_dem import frames_of
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.crosscheck import colmap_rig
@@ -50,8 +49,9 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     segments = _segments(run)
     keys = [_ends(segment.track)[0] for segment in segments]
     images = {key: run.left_image(key) for key in keys}
+    names = {int(row["frame"]): str(row["name"]) for row in frames_of(run.run / "frames.json").get("frames", [])}
     # A drive has a trajectory at each stop: the last one is all of it.
-    model = build(rig, run.one("trajectory", last=True), _names(run.run), segments, images)
+    model = build(rig, run.one("trajectory", last=True), names, segments, images)
     folder.mkdir()
     model.write_text(str(folder))
     return (
@@ -181,9 +181,3 @@ def _points(
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
     """Whether points (n, 3) of the camera frame, metres, project near to pixels (n, 2)."""
     return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= MAX_REPROJECTION_PX)
-
-
-def _names(run: Path) -> dict[int, str]:
-    """Image names by frame number, as the run wrote them down."""
-    rows = json.loads(read_text(run / "frames.json", "frames.json", TABLE)).get("frames", [])
-    return {int(row["frame"]): str(row["name"]) for row in rows}

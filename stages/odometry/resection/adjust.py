@@ -32,9 +32,6 @@ from rille.stages.odometry.resection.priors import Sensors
 from rille.stages.odometry.resection.sensors import OwnTrajectory, moved
 from rille.stages.odometry.resection.trajectory import Chained, ChainLink, account, trajectory_stage
 
-MIN_WAY_SHARE = 0.03
-"""Of the chain's ways along a direction, over those along the main one, for it to tell errors along that direction."""
-
 
 def chain_factors(segments: Sequence[ChainLink], numbers: Sequence[Sequence[int]], row: Mapping[int, int]) -> Factors:
     """Factors from the key frame of each segment to its other frames; the sources of the calibration are the last.
@@ -81,8 +78,10 @@ def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors
     count, sources = len(stated.ends), chain.shared.shape[2]
     seen = np.zeros((count, 6, sources))
     if len(chain.ends) and calibration:
+        # 0.03: of the chain's ways along a direction, over those along the main one, for it to tell errors along that
+        # direction.
         per_way = np.linalg.lstsq(
-            chain.poses[:, :, 3], chain.shared[:, :, -calibration:].reshape(len(chain.ends), -1), rcond=MIN_WAY_SHARE
+            chain.poses[:, :, 3], chain.shared[:, :, -calibration:].reshape(len(chain.ends), -1), rcond=0.03
         )[0]
         seen[:, :, -calibration:] = (stated.poses[:, :, 3] @ per_way).reshape(count, 6, calibration)
     return replace(stated, shared=seen)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Bytes, Floats
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, perturbed
+from rille.stages.geometry.rigid import posed
 from rille.stages.numeric.least_squares import Minimum, levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import Landmarks, SegmentPoints
 from rille.stages.odometry.resection.pnp import (
@@ -194,7 +195,7 @@ class PosedTracks(NamedTuple):
 
         ``inlier`` (n, frame): those that agree, 1.
         """
-        frames = 1 + np.flatnonzero(np.isfinite(poses[1:]).all((1, 2)))
+        frames = 1 + np.flatnonzero(posed(poses[1:]))
         rows = np.flatnonzero(inlier[:, frames].any(1))
         if not len(rows):
             return None

@@ -63,8 +63,6 @@ CORRECTED = 3
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
 
-MIN_TURN_DEG = 4.0
-"""Turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show."""
 
 MIN_SEGMENTS = 3
 """Segments that turn, below which the prior decides."""
@@ -315,7 +313,8 @@ def intrinsics_stage(
     first: while it is wrong, so is what the tracks say of the cameras.
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
-    turning = [part for part in parts if part["turn_deg"] >= MIN_TURN_DEG]
+    # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
+    turning = [part for part in parts if part["turn_deg"] >= 4.0]
     given = Rig.from_dict(rig.meta["rig"])
     focal, upright = given.left.fx, epipolar.standing(given)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]

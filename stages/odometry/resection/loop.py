@@ -27,15 +27,10 @@ from rille.stages.odometry.resection.landmarks import Landmarks, landmarks_of
 from rille.stages.odometry.resection.robust_pose import Resection, ResectParams, resect
 from rille.stages.odometry.resection.trajectory import propagation
 
-MIN_INLIERS, MIN_INLIER_SHARE = 20, 0.4
-"""Landmarks that agree with one pose, and their share of those that match."""
 MIN_BLOCKS, BLOCKS = 5, 4
 """Parts of either image, of 4 x 4, in which landmarks agree."""
 MAX_DEPTH_RATIO = 1.1
 """Median ratio of a point's depths by both pairs, either way."""
-FEATURE_SIGMA = 0.35
-"""Standard deviation of a matched feature's position, in pixels of the image in which features are detected. A track's
-0.2 pixels of the full image gave near landmarks too much weight, and errors twice those stated (flight of EuRoC)."""
 HERE = RigidTransform.identity()
 
 
@@ -96,14 +91,17 @@ def loop_between(a: Features, b: Features, matches: NDArray[np.uint32], seed: in
 def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> tuple[Resection, NDArray[np.uint32]]:
     """Pose of the second camera by landmarks of the first, and the matches (k, 2) that have one."""
     known = matches[np.isfinite(a.landmarks.position[matches[:, 0], 0])]
-    sigma = FEATURE_SIGMA * detected_pixel(b.camera.width, b.camera.height)
+    # 0.35: standard deviation of a matched feature's position, in pixels of the image in which features are detected. A
+    # track's 0.2 pixels of the full image gave near landmarks too much weight, and errors twice those stated (flight of
+    # EuRoC).
+    sigma = 0.35 * detected_pixel(b.camera.width, b.camera.height)
     params = ResectParams.model_validate({"pixel_sigma": sigma, "threshold": 4.0 * sigma})
     try:
         posed = resect(a.landmarks.take(known[:, 0]), b.points[known[:, 1]], b.camera, [HERE], params, seed)
     except DegenerateError as error:
         raise NoLoopError(error.message.split(": ", 1)[-1]) from error
     count = int(posed.inlier.sum())
-    if count < max(MIN_INLIERS, MIN_INLIER_SHARE * len(known)):
+    if count < max(20, 0.4 * len(known)):
         raise NoLoopError(f"{count} of {len(known)} landmarks agree with one pose")
     return posed, known
 

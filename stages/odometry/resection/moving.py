@@ -21,11 +21,6 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.odometry.resection.landmarks import triangulated
 
-DISPARITY_SIGMA_PX = 0.3
-"""Standard deviation of a disparity [pixels of the coarser image], with what a coarse pixel holds of relief."""
-MIN_DEPARTURE_PX = 1.5
-"""Departure of a displacement from that of the still scene, in pixels of its level, from which on something moved."""
-
 
 class MovingParams(Params):
     """Parameters of the stage ``moving``."""
@@ -54,7 +49,8 @@ def departures(
     cells = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), -1).reshape(-1, 2)
     # Coarse pixels may reach beyond the end of the image.
     here = np.minimum(cells * scale + scale // 2, np.subtract(np.shape(disparity["validity"])[::-1], 1))
-    right, sigma = here + _disparities(disparity, here), right_pixels(rig) * DISPARITY_SIGMA_PX
+    # 0.3: standard deviation of a disparity [pixels of the coarser image], with what a coarse pixel holds of relief.
+    right, sigma = here + _disparities(disparity, here), right_pixels(rig) * 0.3
     points = triangulated(here.astype(float), right, rig, RigidTransform.identity(), np.full(len(here), sigma))
     to = T_b_a.inverse() if back else T_b_a
     there, farther = (rig.left.project(to.apply(points.position + share * points.per_pixel)) for share in (0.0, sigma))
@@ -82,7 +78,9 @@ def _at(shift: Floats, places: Floats) -> Floats:
 def moving(off: Floats) -> Bools:
     """Pixels (row, col) of connected parts that depart, each a little widened."""
     with np.errstate(invalid="ignore"):
-        departs = (off > MIN_DEPARTURE_PX).astype(np.uint8)
+        # 1.5: departure of a displacement from that of the still scene, in pixels of its level, from which on something
+        # moved.
+        departs = (off > 1.5).astype(np.uint8)
     # Single rows and corners are errors of the displacements; what is left after opening is a surface.
     opened = cv2.morphologyEx(departs, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)

@@ -30,14 +30,8 @@ from rille.stages.odometry.resection.sensors import (
     laid_on_fixes,
 )
 
-MAX_SIGMA_SHARE = 0.1
-"""Of the standard deviation that a clock's offset had before, up to which it is determined."""
-MANY_LEFT_OUT = 0.05
-"""Share of a sensor's measurements from which on those that were left out are worth a word."""
 MIN_LEAN = math.radians(0.05)
 """Of the world against the vertical that is not worth a word: 1 mm a metre."""
-OTHER_FRAME_M = 1000.0
-"""Distance of the world's origin by positions from the stated one, from which on their frame is another one."""
 MAX_SHARED_SIGMAS = 4.0
 """Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
 REMEDY = {
@@ -58,7 +52,8 @@ class Clock(NamedTuple):
     @property
     def determined(self) -> bool:
         """Whether the motion changes enough to tell."""
-        return self.sigma < MAX_SIGMA_SHARE * OFFSET_SIGMA_S
+        # 0.1: of the standard deviation that a clock's offset had before, up to which it is determined.
+        return self.sigma < 0.1 * OFFSET_SIGMA_S
 
 
 @dataclass
@@ -223,7 +218,8 @@ class Sensors:
         for name in groups:
             fact = self.facts[name]
             # One in a hundred is to be expected.
-            if fact.get("left_out", 0) > MANY_LEFT_OUT * fact.get("measurements", 0):
+            # 0.05: share of a sensor's measurements from which on those that were left out are worth a word.
+            if fact.get("left_out", 0) > 0.05 * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
 
@@ -243,7 +239,9 @@ class Sensors:
         turn = abs(math.remainder(turn, math.tau))
         apart = off > MIN_SIGMAS * math.sqrt(variances[:3].sum())
         turned = turn > max(MIN_SIGMAS * math.sqrt(variances[5]), MIN_LEAN)
-        if off < OTHER_FRAME_M and (apart or turned):
+        # 1000.0: distance of the world's origin by positions from the stated one, from which on their frame is another
+        # one.
+        if off < 1000.0 and (apart or turned):
             text = f"maps lie {off:.2f} m off at the origin and are turned by {math.degrees(turn):.2f} degrees"
             self.lines.append(f"[positions] contradict the stated place: {text}; by them {named}: state these")
 

@@ -25,8 +25,9 @@ direction of the camera in the vehicle is in none. They have two parts:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
@@ -52,8 +53,6 @@ from rille.stages.odometry.resection.pnp import (
 
 MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
-SEED = 1999 * 100_003
-"""Seed of the random samples, to which the frame's number is added."""
 SHARED_SOURCES = 7
 """Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
 SEARCHED_PX = 9.0
@@ -178,7 +177,7 @@ def _robust_start(obs: Observations, predictions: list[Pose], params: ResectPara
     # Twice the threshold: three points fix a pose with errors of their own, which must not cost it its landmarks.
     bound = 2.0 * params.threshold / params.pixel_sigma
     # Truncated squares, not a count: of poses that as many landmarks agree with, the one they fit better.
-    candidates = [*predictions, *_sampled(obs, 2.0 * params.threshold, SEED + frame)]
+    candidates = [*predictions, *_sampled(obs, 2.0 * params.threshold, frame)]
     best = min(candidates, key=lambda pose: float((np.minimum(back_projection(obs, pose).norm, bound) ** 2).sum()))
     for _ in range(2):
         active = back_projection(obs, best).norm <= bound
@@ -193,13 +192,24 @@ def _adjusted(obs: Observations, active: Bools, start: Pose, params: ResectParam
     return levenberg_marquardt(PoseAdjustment(obs, active, params.bias_sigma), start, 50).state
 
 
-def _sampled(obs: Observations, threshold: float, seed: int) -> list[Pose]:
-    """The pose of random samples of landmarks that most others are within ``threshold`` pixels of; none of few."""
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error, options.ransac.random_seed = threshold, seed % 2**31
+def sampled_pose(
+    pixels: Floats, landmarks: Floats, camera: Any, bound: float, seed: int, focal_length: bool = False
+) -> Mapping[str, Any] | None:
+    """COLMAP's pose by random samples that most landmarks (n, 3) are within ``bound`` pixels of; None: of too few.
+
+    ``camera`` is COLMAP's; with ``focal_length`` its focal length is found as well, and written into it.
+    """
+    options = pycolmap.AbsolutePoseEstimationOptions(estimate_focal_length=focal_length)
+    options.ransac.max_error, options.ransac.random_seed = bound, seed % 2**31
+    found: Mapping[str, Any] | None = pycolmap.estimate_absolute_pose(pixels, landmarks, camera, options)
+    return found
+
+
+def _sampled(obs: Observations, bound: float, frame: int) -> list[Pose]:
+    """The pose of random samples, if there is one."""
     # The size plays no part, but must be there.
     camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(Pinhole.of(obs.camera)))
-    answer = pycolmap.estimate_absolute_pose(obs.pixels, obs.landmarks.position, camera, options)
+    answer = sampled_pose(obs.pixels, obs.landmarks.position, camera, bound, 1999 * 100_003 + frame)
     return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer["cam_from_world"].matrix()))]
 
 

@@ -22,23 +22,19 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
-from rille.stages.geometry.rigid import compose, motion, umeyama
+from rille.stages.geometry.rigid import compose, motion, posed, umeyama
 from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
 OFFSET_SIGMA_S = 0.5
 """Of a sensor's clock against the camera's, before anything is known of it."""
-VERTICAL_SIGMA = math.radians(5.0)
-"""Of the world's vertical against that of the place: a plane of ground is a slope."""
 MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
 CAMERA_SHARE = 0.05
 """Error of the camera's own ways that no sensor is doubted for."""
 MIN_TURN = math.radians(1.0)
 """RMS turn of the camera below which an attitude is not tested, noise having any axis; and what its own may err."""
-MIN_WAY_NOISES = 3.0
-"""Noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean nothing."""
 MIN_SIGMAS = 3.0
 """Standard deviations from which on a departure is one of the whole sensor."""
 
@@ -178,7 +174,7 @@ class RelativePrior:
     def _departure(self, own: OwnTrajectory, shift: float) -> tuple[float, str]:
         """By which share of the camera's ways or turns it departs ``shift`` seconds later; why that is too much."""
         sensed = self._at(own.rows, shift)
-        rows = np.flatnonzero(np.isfinite(sensed).all((1, 2)))
+        rows = np.flatnonzero(posed(sensed))
         # Over single frames noise would hide a turned mount.
         lag = max(len(rows) // 16, 1)
         a, b = rows[:-lag], rows[lag:]
@@ -189,7 +185,9 @@ class RelativePrior:
             return 0.0, ""
         if self.drift:
             ways = moves[:, :, 3]
-            if np.sqrt((ways**2).sum(1).mean()) < MIN_WAY_NOISES * math.sqrt(2.0) * _noise(own):
+            # 3.0: noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean
+            # nothing.
+            if np.sqrt((ways**2).sum(1).mean()) < 3.0 * math.sqrt(2.0) * _noise(own):
                 return 0.0, ""
             # A turn that grows along the way leads it aside by half as much.
             allowed = self.drift + 0.5 * self.turn * float(np.linalg.norm(ways, axis=1).mean())
@@ -203,7 +201,7 @@ class RelativePrior:
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
         """Factors from each node to the next that has a pose by the sensor."""
         poses = self._at(own.rows, late)
-        rows = np.flatnonzero(np.isfinite(poses).all((1, 2)))
+        rows = np.flatnonzero(posed(poses))
         if self.drift and not np.diff(poses[rows, :, 3], axis=0).any():
             rows = rows[:0]  # errors are shares of ways, and it has gone none
         a, b = rows[:-1], rows[1:]
@@ -386,5 +384,6 @@ def pieces_with_fixes(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
 
 def anchor(pose: Floats) -> Factors:
     """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
-    root = np.diag([1e-3] * 3 + [1.0 / VERTICAL_SIGMA] * 2 + [0.1])[None]
+    # 5 degrees: of the world's vertical against that of the place: a plane of ground is a slope.
+    root = np.diag([1e-3] * 3 + [1.0 / math.radians(5.0)] * 2 + [0.1])[None]
     return Factors.of(np.array([[-1, 0]]), pose[None], root)

@@ -21,15 +21,8 @@ from rille.stages.odometry.resection.robust_pose import MIN_LANDMARKS, Resection
 
 CONTRADICTION = 2.0
 """Times the threshold from which on a landmark surely does not move as a pose says."""
-SECOND_SHARE = 0.2
-"""Share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less."""
 BODY_SHARE = 0.1
 """The same where the landmarks that do not move in the image are all nearer, as the vehicle's own body is."""
-BESIDE_SHARE = 0.5
-"""Share of its landmarks that the scene has in columns of the image beside what moves; with a lorry before the camera
-0.7 to 0.9, of parts that lie about alike 0.1."""
-BEHIND = 1.5
-"""Times the distance of the far landmarks of what moves that the scene's far ones have; with that lorry 5 to 7."""
 
 
 class AmbiguousError(DegenerateError):
@@ -95,7 +88,8 @@ def moving_by_themselves(
         if len(alone) and _is_scene(scene, pixels[alone], before[alone, 2]):
             return use[alone]
     # The smaller part may be all that shows the motion only where the larger one is the vehicle itself.
-    if len(parts[1].rows) < (BODY_SHARE if body and still.pose is posed else SECOND_SHARE) * total:
+    # 0.2: share of the landmarks from which on a second motion puts the first in doubt: a vehicle ahead has less.
+    if len(parts[1].rows) < (BODY_SHARE if body and still.pose is posed else 0.2) * total:
         return left[:0]
     raise _ambiguity((still, moving), key, total, stays=stays, body=body)
 
@@ -127,5 +121,8 @@ def _is_scene(part: _Part, pixels: Floats, depth: Floats) -> bool:
     """
     left, right = np.quantile(pixels[:, 0], (0.05, 0.95))
     beside = float(np.mean((part.pixels[:, 0] < left) | (part.pixels[:, 0] > right)))
-    behind = np.quantile(part.depth, 0.9) > BEHIND * np.quantile(depth, 0.9)
-    return bool(behind) and beside >= BESIDE_SHARE
+    # 1.5: times the distance of the far landmarks of what moves that the scene's far ones have; with that lorry 5 to 7.
+    behind = np.quantile(part.depth, 0.9) > 1.5 * np.quantile(depth, 0.9)
+    # 0.5: share of its landmarks that the scene has in columns of the image beside what moves; with a lorry before the
+    # camera 0.7 to 0.9, of parts that lie about alike 0.1.
+    return bool(behind) and beside >= 0.5

@@ -10,6 +10,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera
+from rille.stages.odometry.resection.robust_pose import sampled_pose
 
 LEFT_OUT = 0.1
 """Share of the landmarks that contradict a pose from which on the focal length is tried: moving objects and wrong
@@ -41,12 +42,10 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
     count = len(pixels)
     if count < FEWEST or count - agreeing < LEFT_OUT * count:
         return
-    options = pycolmap.AbsolutePoseEstimationOptions(estimate_focal_length=True)
-    options.ransac.max_error, options.ransac.random_seed = bound, frame
     # One focal length, as the solver wants it: that of the columns.
     square = (pixels - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
     zoomed = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=[camera.fx, 0, 0])
-    found = pycolmap.estimate_absolute_pose(square, landmarks, zoomed, options)
+    found = sampled_pose(square, landmarks, zoomed, bound, frame, focal_length=True)
     if found is None:
         return
     agree, larger = found["num_inliers"], zoomed.focal_length / camera.fx - 1.0

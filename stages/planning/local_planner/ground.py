@@ -70,8 +70,6 @@ LIKELY_COST = 4.0
 stones; both mostly remain when seen from near."""
 CAUTION_COST = 0.2
 """Added to the cost of a metre where all wheels are on caution ground."""
-DOUBT_WEIGHT = 60
-"""Ratio of the cost of doubted ground to that of caution ground: one wheel on it more than triples the cost."""
 PROXIMITY_COST = 0.5
 """Added to the cost of a metre at the margin of a hazard; it falls to 0 at twice the margin."""
 HERE_WHEELBASES = 0.3
@@ -145,7 +143,8 @@ class Ground:
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, LIKELY_COST, unknown)
         # Of the five parts that stand on ground: the wheels and the middle.
-        caution = CAUTION_COST * ((gaps.caution + DOUBT_WEIGHT * gaps.doubted) / 5)
+        # 60: ratio of the cost of doubted ground to that of caution ground: one wheel on it more than triples the cost.
+        caution = CAUTION_COST * ((gaps.caution + 60 * gaps.doubted) / 5)
         # Far doubts cost no more than unknown ground.
         fades = (self._away(x, y) > NEAR_WHEELBASES) & ~stays
         caution = np.where(fades, np.minimum(caution, UNKNOWN_COST - 1.0), caution)

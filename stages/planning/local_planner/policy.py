@@ -31,8 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.errors import InputError
-from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing
 from rille.stages.planning.local_planner.ground import (
     MIN_LEG_WHEELBASES,
@@ -52,6 +50,7 @@ from rille.stages.planning.local_planner.route import (
     vertices,
     within_turn,
 )
+from rille.stages.planning.path_ground import cell_within
 
 Point = tuple[float, float]
 Before = tuple[Floats, NDArray[np.int8]]
@@ -61,8 +60,6 @@ MAX_LOOKS = 3
 """Views taken from one place without a leg, after which the unknown ground ahead is closed."""
 MIN_GAIN_SHARE = 0.15
 """Of its cost, by which a new path must be cheaper to replace the present one."""
-MAX_LOOK_TURN = math.radians(120.0)
-"""Largest turn that is tried to see the way from one place; one beyond the bound of a leg is made in several legs."""
 LOOK_TURN = math.radians(25.0)
 """First turn of a look around; the next ones go as far to the other side."""
 
@@ -117,7 +114,7 @@ def plan_leg(
     """
     start, heading, memory = (stand[0], stand[1]), stand[2], memory or PlannerMemory()
     for name, point in (("start", start), ("goal", goal)):
-        _check(footing.lattice, name, point)
+        cell_within(footing.lattice, f"the {name}", point)
     base = footing.vehicle.wheel_base
     left = math.hypot(goal[0] - start[0], goal[1] - start[1])
     if left <= TOLERANCE_WHEELBASES * base:
@@ -167,7 +164,9 @@ class _Plan:
         least = MIN_LEG_WHEELBASES * base
         # A last piece to the goal may be shorter.
         if length_of(leg) < min(least, length_of(self.pieces) - 1e-9):
-            return self._look(MAX_LOOK_TURN) or self._closed()
+            # 120 degrees: largest turn that is tried to see the way from one place; one beyond the bound of a
+            # leg is made in several legs.
+            return self._look(math.radians(120.0)) or self._closed()
         facing = 0.0
         view = None if target is None else target.last_view(leg, bound)
         if view is not None and view[0] >= least:
@@ -259,17 +258,6 @@ def shortest(footing: Footing, stand: Stand, goal: Point, params: LocalPlannerPa
     if not np.isfinite(ground.from_start(cost)):
         return None
     return length_of(straightened(ground.way(move), heading, ground.clear, ground.cell))
-
-
-def _check(lattice: Lattice, name: str, point: Point) -> None:
-    row, col = (int(v) for v in np.rint(lattice.index(point)))
-    if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
-        x0, x1, y0, y1 = lattice.bounds
-        raise InputError(
-            "RIL-366",
-            f"the {name} ({point[0]:.3f}, {point[1]:.3f}) m is outside the map",
-            remedy=f"give x in {x0:.3f}..{x1:.3f} and y in {y0:.3f}..{y1:.3f} m",
-        )
 
 
 def _why_closed(ground: Ground, goals: Bools, cost: Floats) -> str:

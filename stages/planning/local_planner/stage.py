@@ -35,9 +35,6 @@ Point = tuple[float, float]
 
 
 HAZARD_MAPS = ("risk", "reason", "p_hazard", "p_wheel")
-MIN_DOUBTED_PROBABILITY = 0.02
-"""Probability of a hazard to a wheel from which near ground is doubted: 5 % of the ground on which wheels may stand,
-with all but 4 of 170 edges that the map missed (beds 1 to 9 of ``benchmarks/loop.py`` at 10 %)."""
 MAX_CLEAR_PROBABILITY = 0.02
 """Probability of a hazard below which ground seen from afar alone may be driven on; of such places for a wheel 0.005 %
 had an edge that the map missed, of all places 0.37 %."""
@@ -114,7 +111,9 @@ def seen_so_far(near: Bundle, far: Bundle | None) -> Hazards:
         unknown &= ~(maps[2] < MAX_CLEAR_PROBABILITY)
         glanced = unknown & (maps[0] < HAZARDOUS)
     risk, reason, p_hazard, p_wheel = maps
-    return Hazards(risk, reason, p_hazard, p_wheel, unknown, glanced, p_wheel >= MIN_DOUBTED_PROBABILITY)
+    # 0.02: probability of a hazard to a wheel from which near ground is doubted: 5 % of the ground on which wheels may
+    # stand, with all but 4 of 170 edges that the map missed (beds 1 to 9 of ``benchmarks/loop.py`` at 10 %).
+    return Hazards(risk, reason, p_hazard, p_wheel, unknown, glanced, p_wheel >= 0.02)
 
 
 def _stands(poses: Floats, T_vehicle_left: RigidTransform) -> list[Stand]:

@@ -34,8 +34,6 @@ HEADING_STEPS = np.concatenate([HEADING_STEPS, -HEADING_STEPS])
 HEADING_ANGLES = np.mod(np.arctan2(-HEADING_STEPS[:, 1], -HEADING_STEPS[:, 0]), 2 * np.pi)
 STEP_LENGTHS = np.hypot(HEADING_STEPS[:, 0], HEADING_STEPS[:, 1])
 AHEAD, BACK, TO_LEFT, TO_RIGHT = 0, 1, 2, 3
-MAX_OFF_TRACK = math.radians(25.0)
-"""Of a heading of the lattice from one that was driven; the next heading is at most 27 degrees away."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,9 @@ class LatticeGraph:
         on = np.zeros(self.pose.shape, np.bool_)
         for k, angle in enumerate(HEADING_ANGLES):
             off = np.remainder(heading - self.grid.heading - angle + np.pi, 2 * np.pi) - np.pi
-            along = inside & (np.abs(off) < MAX_OFF_TRACK)
+            # 25 degrees: of a heading of the lattice from one that was driven; the next heading is at most 27
+            # degrees away.
+            along = inside & (np.abs(off) < math.radians(25.0))
             on[k % HALF_TURN_HEADINGS, row[along], col[along]] = True
         on = ndimage.binary_dilation(on, np.ones((1, 3, 3)))
         for cost, known in zip((self.pose, self.step, self.turn), self.known, strict=True):

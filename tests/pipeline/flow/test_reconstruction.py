@@ -85,7 +85,9 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
     assert labels(graph, "swap_check") == ["swap_check/2", "swap_check/3", "swap_check/4", "swap_check/5"]
     assert products.keyframes is not None
     assert products.keyframes.spec.args == {"frames": 7, "unfit": [4], "behind": [3]}
-    motions = products.tracks[0].inputs["motions"]
+    track = products.resections[0].inputs["track"]
+    assert isinstance(track, Handle)
+    motions = track.inputs["motions"]
     assert isinstance(motions, list)
     assert [h.label for h in motions] == ["motion/0-1", "motion/1-2", "motion/2-4"]
     assert products.trajectory is not None

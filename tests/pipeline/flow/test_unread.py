@@ -13,13 +13,14 @@ from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
 from rille.pipeline.commands.sequences.check import check
 from rille.pipeline.engine.graph import Graph
+from rille.pipeline.export.view import Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import Settings
 
 
-def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> session.Settled:
+def settled(tmp_path: Path, sequence: str, *assignments: str, config: Path | None = None) -> Settled:
     return session.settings(sequence, session.Options(assignments, config=config, cache=tmp_path / "cache"))
 
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.report import figures
+from rille.pipeline.report import figures, gallery
 from rille.pipeline.report.canvas import Block, Figure
-from rille.pipeline.report.gallery import Drawing
 
 
 def draw(seed: int) -> Figure:
@@ -19,7 +18,7 @@ def draw(seed: int) -> Figure:
     def maker(_: Any) -> Block:
         return Block((figures.raster(elevation, "elevation, m", "", extent=(0.0, 1.0, 0.0, 1.0)),))
 
-    return Drawing("Elevation", maker, lambda p: ()).figure(SimpleNamespace())
+    return gallery.draw("Elevation", maker, SimpleNamespace())
 
 
 def test_threads_share_no_sheet_at_a_time() -> None:

@@ -135,6 +135,8 @@ def test_error_never_without_completeness(whole: Written) -> None:
     assert found["dem_pairs_completeness_min"]["value"] == pytest.approx(0.7)
     assert found["dem_merged_rmse"]["value"] == pytest.approx(4e-4, rel=1e-3)
     assert found["path_check_hazard_cells"]["value"] == 0
+    # Named by itself: the way of the trajectory's truth is another path.
+    assert found["path_check_path_length"]["label"] == "Path length"
     for name, metric in found.items():
         if metric["truth"] and not name.startswith("path_check"):
             assert metric["completeness"], name

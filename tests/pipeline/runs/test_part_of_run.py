@@ -25,7 +25,9 @@ def part(chain: Chain, until: tuple[str, ...] = (), only: tuple[str, ...] = ()) 
     """The graph of a part, over a store that has every artifact of a reconstruction but those of files."""
     graph = Graph(cut=part_of_run.cut(until, only))
     products, _ = dataflow(graph, chain.sequence, chain.config, FRAMES)
-    view = RunView("", chain.sequence, FRAMES, products, (), chain.config, until=until, only=only)
+    view = RunView(
+        sequence=chain.sequence, frames=FRAMES, config=chain.config, products=products, until=until, only=only
+    )
     graph.last = lambda: run_files.lay_out(graph, view, {})
     return graph, driver.run(graph, chain.store, driver.RunOptions(dry=True))
 

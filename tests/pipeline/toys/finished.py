@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -223,7 +224,6 @@ def checks() -> dict[str, Bundle]:
 
 NAMES = {
     "images": "image",
-    "tracks": "track",
     "resections": "resect",
     "rigs": "rig",
     "orientations": "orientation",
@@ -331,7 +331,12 @@ def _blank(fig: object, alt: str, *, photo: bool = False) -> canvas.Panel:
 
 def report(folder: Path, run: RunView) -> None:
     """Both files of the report, of artifacts as they are."""
-    write_report(folder, run, summary.collect(run), [drawing.figure(run) for drawing in gallery.DRAWINGS])
+    with TemporaryDirectory() as made:
+        for drawing in gallery.OUTPUTS:
+            assert drawing.write is not None
+            drawing.write(Path(made) / drawing.name, run)
+        figures = [canvas.FIGURE.validate_json((Path(made) / one.name).read_bytes()) for one in gallery.OUTPUTS]
+    write_report(folder, run, summary.collect(run), figures)
 
 
 Written = tuple[dict[str, Any], Page, str, Path]

@@ -57,6 +57,18 @@ def test_a_small_turn_of_a_straight_drive_is_not_told_from_the_camera() -> None:
     assert hand_eye(estimated(true, 1), rigid.compose(true, small)) is None
 
 
+def test_it_is_judged_by_the_steps_that_the_relative_error_has() -> None:
+    true = flight(3)
+    given, estimate = rigid.compose(true, rigid.inverse(OFF)), estimated(true, 3)
+    given[10:12] = np.nan
+    p, q = rigid.steps(estimate, given)
+    assert len(p) == len(q) == 9 + 17
+    assert hand_eye(estimate, given) is not None
+    # Truth of every second frame: a motion over two frames is no step.
+    given[1::2] = np.nan
+    assert hand_eye(estimate, given) is None
+
+
 def test_figures_without_it_stand_beside_those_as_given() -> None:
     true = flight(7)
     poses = estimated(true, 7)

@@ -154,8 +154,7 @@ def test_a_turn_by_half_the_field_of_view_is_found_by_keypoints():
     shares = {}
     for below in (0.0, 0.5):
         out = run(*images, turn_below=below)
-        maps = (out["column_disparity"], out["row_disparity"], out["validity"])
-        shares[below], wrong = judge(motion.Motion(out.meta["level"], *maps), flow)
+        shares[below], wrong = judge(motion.Motion.of(out), flow)
     assert shares[0.0] < 0.4
     assert shares[0.5] > 0.8
     assert wrong < 0.03

@@ -9,7 +9,7 @@ import pytest
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import track as tracking
-from rille.stages.odometry.displacements import LevelDisplacements, common_similarity, fit_affinity, known_median
+from rille.stages.odometry.displacements import Motion, common_similarity, fit_affinity, known_median
 from rille.stages.odometry.track import (
     TrackParams,
     track,
@@ -45,6 +45,10 @@ def sequence(scales, shifts, noise=1.0, valid=None):
     return frames, places
 
 
+def on_level_2(column, row):
+    return Motion(2, column.astype(np.float32), row.astype(np.float32), np.zeros(column.shape, np.uint8))
+
+
 def motions(places, error=0.0):
     """Exact coarse motion on level 2, plus an error in pixels, between successive frames."""
     cols, rows = np.meshgrid((np.arange(COLS // 4) + 0.5) * 4 - 0.5, (np.arange(ROWS // 4) + 0.5) * 4 - 0.5)
@@ -55,7 +59,7 @@ def motions(places, error=0.0):
         scale = here(centre + 1.0)[0] - here(centre)[0]  # undo "here" to reach the first frame
         first = centre + (grid - here(centre)) / scale
         d = (there(first) - grid + error).astype(np.float32)
-        out.append(LevelDisplacements(d[..., 0].copy(), d[..., 1].copy(), 2))
+        out.append(on_level_2(d[..., 0], d[..., 1]))
     return out
 
 
@@ -127,8 +131,8 @@ def test_masked_regions_hold_no_point_in_any_frame():
 def test_holes_in_the_motion_are_bridged_or_lose_the_point():
     frames, places = sequence([1.0, 1.0], [(0, 0), (6.0, 3.0)])
     motion = motions(places)[0]
-    motion.column[::2], motion.row[::2] = np.nan, np.nan
-    motion.column[:, 40:] = np.nan
+    motion.column_disparity[::2], motion.row_disparity[::2] = np.nan, np.nan
+    motion.column_disparity[:, 40:] = np.nan
     found = track(frames, [motion], PARAMS)
     tracked = np.isfinite(found.points[:, 1]).all(-1)
     assert tracked[(found.points[:, 0, 0] < 155)].mean() > 0.8
@@ -137,7 +141,7 @@ def test_holes_in_the_motion_are_bridged_or_lose_the_point():
 
 def test_untextured_frames_give_no_track_and_no_error():
     flat = build(np.full((ROWS, COLS), 90.0, np.float32), PyramidParams(levels=3))
-    still = LevelDisplacements(np.zeros((50, 65), np.float32), np.zeros((50, 65), np.float32), 2)
+    still = on_level_2(np.zeros((50, 65)), np.zeros((50, 65)))
     found = track([flat, flat], [still], PARAMS)
     assert found.points.shape == (0, 2, 2)
 
@@ -145,7 +149,7 @@ def test_untextured_frames_give_no_track_and_no_error():
 def test_displacement_is_looked_up_at_the_pixel_centre_of_the_coarse_level():
     column = np.full((5, 5), 7.0, np.float32)
     column[2, 2] = np.nan
-    motion = LevelDisplacements(column, np.arange(25, dtype=np.float32).reshape(5, 5), 2)
+    motion = on_level_2(column, np.arange(25).reshape(5, 5))
     # Coarse pixel 2 reaches from 7.5 to 11.5.
     at = np.array([[7.6, 7.6], [1.5, 1.5], [np.nan, 3.0]])
     found = motion.at(at)
@@ -181,7 +185,8 @@ def test_stage_writes_what_it_declares_and_the_same_bits_twice():
             for f in frames
         ],
         "motions": [
-            Bundle({"column_disparity": m.column, "row_disparity": m.row}, {"level": 2}) for m in motions(places)
+            Bundle({name: values for name, values in vars(m).items() if name != "level"}, {"level": 2})
+            for m in motions(places)
         ],
     }
     first, second = (track_stage.run(PARAMS, {"frames": [4, 5, 6]}, inputs) for _ in range(2))
@@ -221,7 +226,7 @@ def test_a_turn_that_goes_on_does_not_lose_the_points():
     for a, b in itertools.pairwise(angles):
         middle = np.array([COLS / 2, ROWS / 2])
         d = ((grid - middle) @ in_plane(b - a).T + middle - grid + 1.0).reshape(*cols.shape, 2)
-        steps.append(LevelDisplacements(d[..., 0].astype(np.float32), d[..., 1].astype(np.float32), 2))
+        steps.append(on_level_2(d[..., 0], d[..., 1]))
     found = track(frames, steps, PARAMS)
     off = errors(found, places)
     first = found.birth == 0

@@ -5,11 +5,11 @@ import pytest
 from test_motion import held, judge, run, taken
 
 from rille.stages.geometry.geometry import rotation_exp
-from rille.stages.odometry.motion import Motion
+from rille.stages.odometry.displacements import Motion
 
 
 def found_flow(out):
-    return Motion(out.meta["level"], out["column_disparity"], out["row_disparity"], out["validity"])
+    return Motion.of(out)
 
 
 @pytest.mark.parametrize("degrees", [30.0, -21.0])

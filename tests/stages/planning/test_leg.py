@@ -124,7 +124,7 @@ def test_at_the_goal_it_ends() -> None:
 
 
 def test_a_goal_outside_the_map_is_refused_with_the_map() -> None:
-    with raises("RIL-366", "0.000", "3.000", "-0.4"):
+    with raises("RIL-406", "(0, 3)", "-0.4"):
         plan_leg(ground(), AT, (0.0, 3.0), P)
 
 
