@@ -27,7 +27,7 @@ def check_focal(camera: Camera, name: str) -> None:
         It is one.
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
-        # The angle of view is 169 or 0.06 degrees; that of a fisheye, whose focal length is longer, a full circle at most.
+        # The angle of view is 169 or 0.06 degrees; a fisheye, with a longer one, sees a full circle at most.
         if not 0.05 <= f / side <= 1000.0:
             size = f"{camera.width} x {camera.height} pixels"
             text = f"camera {name}: {what} = {f:g} px cannot be that of images of {size}"
