@@ -46,8 +46,8 @@ from rille.stages.terrain.locus.views import OrthoPair
 
 FLOOR_PX = 0.03
 """Pixels of disparity."""
-STEP_FACTOR = 0.3
-"""Of the squared step: a position is uncertain by 0.55 cells or pixels."""
+STEP_FACTOR = 0.2
+"""Of the squared step: a position is uncertain by 0.45 cells or pixels."""
 REST_FACTOR = 0.5
 """Of r^2 / I."""
 SHADE_FACTOR = 1.9
