@@ -131,7 +131,8 @@ LIMITS = {
             "RIL-664",
             "residual or row offset",  # px, half px
             most=1.0,
-            remedy="the calibration is off; reconstruct repairs what the images tell, `rille calibrate` the rest",
+            remedy="are the images rectified already (images.rectified)? Else the calibration is off: reconstruct "
+            "repairs what the images tell, `rille calibrate` the rest",
         ),
     ),
     "repetition": (
