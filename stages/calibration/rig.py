@@ -190,7 +190,7 @@ def _word(p: Parameter) -> str:
 def _off(p: Parameter) -> str:
     """By how much a parameter is off, in words; of turned images the linear estimate is no angle."""
     if abs(p.value) < math.radians(MAX_IMAGE_TURN_DEG):
-        return f"{_word(p)} is off by {math.degrees(p.value):+.2f} degrees"
+        return f"{_word(p)} is off by {math.degrees(p.value):+.2f} +- {math.degrees(p.sigma):.2f} degrees"
     turned = "" if p.name == "baseline_forward" else " (are the images of both cameras turned?)"
     return f"{_word(p)} is off by more than {MAX_IMAGE_TURN_DEG:g} degrees{turned}"
 

@@ -315,7 +315,7 @@ def test_turned_images_are_named_and_no_knock(degrees, words):
 @pytest.mark.parametrize(
     ("name", "degrees", "words"),
     [
-        ("baseline_across", -3.0, "baseline across is off by -3.00 degrees"),
+        ("baseline_across", -3.0, "baseline across is off by -3.00 +- 0.57 degrees"),
         ("baseline_across", 837.0, "more than 45 degrees (are the images of both cameras turned?)"),
         ("baseline_forward", -60.0, "baseline forward is off by more than 45 degrees"),
     ],
