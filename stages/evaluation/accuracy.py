@@ -23,9 +23,9 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.clock import TruePositions, late_truth
-from rille.stages.evaluation.conventions import better_reading
-from rille.stages.evaluation.hand_eye import hand_eye, misplaced, without_it
+from rille.stages.evaluation.reading.clock import TruePositions, late_truth
+from rille.stages.evaluation.reading.conventions import better_reading
+from rille.stages.evaluation.reading.hand_eye import hand_eye, misplaced, without_it
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid

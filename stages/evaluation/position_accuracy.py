@@ -3,7 +3,7 @@
 A GNSS receiver or a total station says where, not how turned. Its frame shares the vertical with the world at most, its
 clock may be off by a constant. Truth is therefore moved rigidly in the plane (turned about the vertical and shifted; in
 height it is shifted alone) so that the squared distances are least (Umeyama 1991, doi:10.1109/34.88573), for each
-offset of its clock (:mod:`rille.stages.evaluation.clock`).
+offset of its clock (:mod:`rille.stages.evaluation.reading.clock`).
 
 Where the world's vertical was not measured and the truth has heights, it is moved rigidly in space. What was measured
 may stand off the camera: its lever arm ``l`` in the camera's frame (``P_i + R_i l`` is the antenna) is given, or fitted
@@ -21,8 +21,8 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import counts, over_length
-from rille.stages.evaluation.clock import MIN_FRAMES, Offset, TruePositions, find_offset
-from rille.stages.evaluation.conventions import UNITS
+from rille.stages.evaluation.reading.clock import MIN_FRAMES, Offset, TruePositions, find_offset
+from rille.stages.evaluation.reading.conventions import UNITS
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm

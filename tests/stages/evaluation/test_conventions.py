@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
-from rille.stages.evaluation.conventions import better_reading
+from rille.stages.evaluation.reading.conventions import better_reading
 from rille.stages.geometry.geometry import RigidTransform
 
 NED = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.evaluation.accuracy import accuracy_stage
-from rille.stages.evaluation.hand_eye import hand_eye
+from rille.stages.evaluation.reading.hand_eye import hand_eye
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.clock import TruePositions, find_offset
 from rille.stages.evaluation.position_accuracy import position_accuracy, position_accuracy_stage
+from rille.stages.evaluation.reading.clock import TruePositions, find_offset
 from rille.stages.geometry.rigid import fit_rigid
 
 RATE = 10.0

@@ -1,0 +1,1 @@
+"""How given truth is to be read: conventions of its poses, its clock, and where its body sits on the rig."""
