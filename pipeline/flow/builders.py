@@ -431,6 +431,7 @@ def merge_tiles(
     footprints: Series[TileIndexFacts],
     dems: Mapping[int, Handle[DemFacts]],
     steps: Mapping[str, int],
+    inverse_depth_std: float | None = None,
 ) -> list[Handle[MergeFacts]]:
     """Add one task for each world tile that a model touches; it reads these models and nothing else.
 
@@ -440,6 +441,7 @@ def merge_tiles(
     footprints : facts of stage ``tile_index``, one a model.
     dems : world models by pair.
     steps : exposure of the pairs whose grey values are levelled, as stage ``radiometry`` gives them.
+    inverse_depth_std : of a rig that was repaired, as stage ``intrinsics`` gives it.
     """
     touching: dict[tuple[int, int], list[tuple[int, Box]]] = {}
     for meta in footprints:
@@ -452,8 +454,16 @@ def merge_tiles(
         lattice = tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()
         # Of this tile's pairs alone: a level that changes elsewhere leaves the tile in the cache.
         exposure = {str(pair): steps[str(pair)] for pair, _ in here if str(pair) in steps}
-        there = [dems[pair] for pair, _ in here]
-        merged.append(node(merge_stage, f"merge/{tx}_{ty}", dems=there, lattice=lattice, exposure=exposure or None))
+        merged.append(
+            node(
+                merge_stage,
+                f"merge/{tx}_{ty}",
+                dems=[dems[pair] for pair, _ in here],
+                lattice=lattice,
+                exposure=exposure or None,
+                inverse_depth_std=inverse_depth_std,
+            )
+        )
     return merged
 
 

@@ -219,7 +219,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
     yield Complete(("overlap_qa", "overlap_audit"))
     levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
-    p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"])
+    unsure: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics] if p.intrinsics else [])
+    rig_error = unsure[0].meta.get("inverse_depth_std") if unsure and unsure[0] else None
+    p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"], rig_error)
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)

@@ -87,6 +87,8 @@ class IntrinsicsFacts(Facts):
     yaw: list[float]
     correction: list[float]
     corrected: list[float]
+    inverse_depth_std: NotRequired[float]
+    """Of the error that all inverse depths share by the yaw of a rig that was repaired, 1/m."""
     contradiction: NotRequired[str]
 
 

@@ -7,16 +7,18 @@ deviation and r its residual, a model's weight is
 
 Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
 
-The standard deviation of the result has three parts. Each model's own, independent of the others'; what the models
+The standard deviation of the result has four parts. Each model's own, independent of the others'; what the models
 have in common, since they saw the same light and the same shapes (``alike`` is the correlation of two models' errors);
-and that of the poses. With s_i the shares of the weights, p_i what the covariance of model i's pose says of the height
-there (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)),
+that of the poses; and that of a rig that was repaired. With s_i the shares of the weights, p_i what the covariance of
+model i's pose says of the height there (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)), r the standard deviation
+of the error that all inverse depths share, h_i and d_i the height of camera i above the cell and the cell's depth,
 
-    sigma^2 = (1 - alike) sum (s_i sigma_i)^2 + alike (sum s_i sigma_i)^2 + (sum s_i p_i)^2
+    sigma^2 = (1 - alike) sum (s_i sigma_i)^2 + alike (sum s_i sigma_i)^2 + (sum s_i p_i)^2 + (sum s_i h_i d_i r)^2
 
-Poses of models that overlap have nearly all of their way in common, so that their errors neither average out over the
-models nor over the cells of one. ``relief_std`` is the first part alone (alike = 0): that of a cell against the ground
-around it, which is what slopes and steps are judged by.
+(a point moves along its ray by d r of its distance). Poses of models that overlap have nearly all of their way in
+common, so that their errors, as the rig's, neither average out over the models nor over the cells of one.
+``relief_std`` is the first part alone (alike = 0): that of a cell against the ground around it, which is what slopes
+and steps are judged by.
 
 Sums run over the models in the order of their pairs, in double precision, so equal input gives equal bits wherever a
 tile or a strip begins. A tile is merged in strips of lines, of each model only the strip is read: what is in memory at
@@ -27,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -75,7 +77,7 @@ NOTHING: Mapping[str, Any] = dict.fromkeys(Merged._fields, np.float32(np.nan)) |
 
 
 def merge_cells(
-    maps: Floats32, layers: Sequence[ModelLayer], strip: Lattice, alike: float, worst: float
+    maps: Floats32, layers: Sequence[ModelLayer], strip: Lattice, errors: CommonErrors, worst: float
 ) -> dict[str, Any]:
     """Maps (rows, cols) of :class:`Merged` by name; weights and equations are those of the module.
 
@@ -84,7 +86,7 @@ def merge_cells(
     maps : (4, n, rows, cols) elevations, their standard deviations, residuals and grey values of n models, NaN
         undefined, on the cells of ``strip``.
     layers : (n,) those models.
-    alike : correlation of two models' errors.
+    errors : that the models share.
     worst : greatest standard deviation but for the poses, m.
     """
     z, sigma, residual, ortho = maps.astype(np.float64)
@@ -106,22 +108,23 @@ def merge_cells(
     mean, together = _total(share * z), _total(share * sigma)
     apart = _total((share * sigma) ** 2)
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
-    variance = apart + alike * (together * together - apart)
-    # Poses drift together, so that their errors do not average out.
+    variance = apart + errors.alike * (together * together - apart)
+    # Poses drift together, so that their errors do not average out; nor do those of one rig.
     placed = _total(share * _swing(layers, strip))
+    ranged = _total(share * _stretch(layers, strip, z)) * errors.inverse_depth_std
     grey = np.minimum(np.array([layer.gain for layer in layers])[:, None, None] * ortho, 255.0)
     sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** ORTHO_WEIGHT_EXPONENT, 0.0)
     greys = _total(sharp)
     merged = {
         "elevation": mean,
-        "elevation_std": np.sqrt(variance + placed * placed),
+        "elevation_std": np.sqrt(variance + placed * placed + ranged * ranged),
         "spread": np.sqrt(_total(share * (z - mean) ** 2)),
         "count": np.count_nonzero(weight, axis=0),
         "source": np.array([layer.pair for layer in layers])[weight.argmax(axis=0)],
         "ortho": np.divide(_total(sharp * np.nan_to_num(grey)), greys, out=np.full(top.shape, np.nan), where=greys > 0),
         "relief_std": np.sqrt(apart),
     }
-    # The limit is on the models' own errors, without the poses' part.
+    # The limit is on the models' own errors, without the poses' and the rig's part.
     good = (top > 0.0) & (np.sqrt(variance) <= worst)
     return {name: np.where(good, a.astype(NOTHING[name].dtype), NOTHING[name]) for name, a in merged.items()}
 
@@ -134,11 +137,21 @@ def _total(values: Floats) -> Floats:
 def _swing(layers: Sequence[ModelLayer], strip: Lattice) -> Floats:
     """Standard deviations (n, rows, cols) of the elevations by the covariances of (height, rotation about x, y)."""
     centre = np.array([layer.pose.centre for layer in layers])
-    dx, dy = (strip.xs() - centre[:, :1])[:, None, :], (strip.ys() - centre[:, 1:])[:, :, None]
+    dx, dy = (strip.xs() - centre[:, :1])[:, None, :], (strip.ys() - centre[:, 1:2])[:, :, None]
     covariance = np.array([layer.pose.covariance for layer in layers])[..., None, None]
     tilt = dy * dy * covariance[:, 1, 1] + dx * dx * covariance[:, 2, 2] - 2.0 * dx * dy * covariance[:, 1, 2]
     both = covariance[:, 0, 0] + tilt + 2.0 * (dy * covariance[:, 0, 1] - dx * covariance[:, 0, 2])
     return np.asarray(np.sqrt(np.maximum(0.0, both)))
+
+
+def _stretch(layers: Sequence[ModelLayer], strip: Lattice, z: Floats) -> Floats:
+    """Changes (n, rows, cols) of the elevations, m^2, by one error, 1/m, of all inverse depths."""
+    x, y, above = strip.xs()[None, :], strip.ys()[:, None], []
+    for pose, elevation in zip([layer.pose for layer in layers], z, strict=True):
+        dx, dy, dz = x - pose.centre[0], y - pose.centre[1], elevation - pose.centre[2]
+        depth = pose.forward[0] * dx + pose.forward[1] * dy + pose.forward[2] * dz
+        above.append(-dz * depth)
+    return np.array(above)
 
 
 def _median(values: Floats, weight: Floats) -> Floats:
@@ -174,24 +187,32 @@ class MergeParams(Params):
 
 @dataclass(frozen=True)
 class Placed:
-    """Error of a model's pose: ``centre`` (2,) x and y of its camera, m; ``covariance`` (3, 3) of the height of the
-    camera, m, and of its rotations about x and y, rad, in the world frame.
+    """Camera of a model in the world frame: ``centre`` (3,), m; ``covariance`` (3, 3) of its height, m, and of its
+    rotations about x and y, rad; ``forward`` (3,), its optical axis, without which its depths count as exact.
     """
 
     centre: Floats
     covariance: Floats
+    forward: Floats = field(default_factory=lambda: np.zeros(3))
 
     @staticmethod
     def of(meta: Mapping[str, Any]) -> Placed:
-        """Read the covariance from the facts of a model; without one the pose counts as exact."""
-        if meta.get("pose_covariance") is None:
+        """Read the pose from the facts of a model; without a covariance it counts as exact."""
+        if "T_frame_left" not in meta:
             return EXACT
-        full = np.array(meta["pose_covariance"], dtype=np.float64).reshape(6, 6)
-        at = RigidTransform.from_matrix(meta["T_frame_left"]).translation
-        return Placed(at[:2], full[2:5, 2:5])
+        T = RigidTransform.from_matrix(meta["T_frame_left"])
+        full = np.array(meta.get("pose_covariance", np.zeros(36)), dtype=np.float64).reshape(6, 6)
+        return Placed(T.translation, full[2:5, 2:5], T.rotation[:, 2])
 
 
-EXACT = Placed(np.zeros(2), np.zeros((3, 3)))
+EXACT = Placed(np.zeros(3), np.zeros((3, 3)))
+
+
+class CommonErrors(NamedTuple):
+    """Errors that models share: ``alike``, correlation of two at one cell; ``inverse_depth_std``, 1/m, of a rig."""
+
+    alike: float
+    inverse_depth_std: float = 0.0
 
 
 def footprint(elevation: Floats32, x: Floats, y: Floats, centre: Floats, angle: float) -> Floats:
@@ -226,10 +247,14 @@ class ModelLayer:
     pose: Placed = EXACT
 
 
-def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> Merged:
+def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams, inverse_depth_std: float = 0.0) -> Merged:
     """Merge elevation models, each of another pair, on a tile of their common lattice.
 
     The result does not depend, in any bit, on the order of the layers, nor on where tiles begin.
+
+    Parameters
+    ----------
+    inverse_depth_std : of the error that all inverse depths share, 1/m.
 
     Raises
     ------
@@ -239,6 +264,7 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> M
     ordered = sorted(layers, key=lambda layer: layer.pair)
     assert len({layer.pair for layer in ordered}) == len(ordered)
     ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
+    errors = CommonErrors(params.alike, inverse_depth_std)
     out = {name: np.full(tile.shape, none) for name, none in NOTHING.items()}
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * tile.cell
     # Some sixteen numbers of eight bytes a cell and model.
@@ -247,7 +273,7 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams) -> M
         strip = Lattice.at(tile.i0, tile.j0 - start, tile.cell, min(lines, tile.rows - start), tile.cols)
         present = [layer for layer in ordered if strip.intersection(layer.lattice) is not None]
         if present:
-            part = merge_cells(_read(present, strip), present, strip, params.alike, worst)
+            part = merge_cells(_read(present, strip), present, strip, errors, worst)
             for name, values in part.items():
                 out[name][start : start + strip.rows] = values
     return Merged(**out)
@@ -291,10 +317,10 @@ def _fine(dem: Bundle, lattice: Lattice, most: float | None) -> Callable[[str, W
 
 @stage(
     "merge",
-    version=3,
+    version=4,
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", "float32", "nan", "world"),
-        raster("elevation_std", "m", "standard deviation of the elevation, poses included", "float32", "nan", "world"),
+        raster("elevation_std", "m", "standard deviation of the elevation, all included", "float32", "nan", "world"),
         raster("spread", "m", "standard deviation of the merged models about the elevation", "float32", "nan", "world"),
         raster("count", "1", "number of merged models", "uint16", "0", "world"),
         raster("source", "1", "pair of the greatest weight", "int32", "-1", "world"),
@@ -309,6 +335,7 @@ def merge_stage(
     *,
     lattice: Lattice,
     exposure: Mapping[str, int] | None = None,
+    inverse_depth_std: float = 0.0,
 ) -> Bundle[MergeFacts]:
     """Merged elevation model and ortho image of one tile of the world."""
     steps = exposure or {}
@@ -317,7 +344,7 @@ def merge_stage(
         pair, own = dem.meta["pair"], Lattice.from_dict(dem.meta["lattice"])
         gain = math.exp(LOG_GAIN_STEP * steps.get(str(pair), 0))
         layers.append(ModelLayer(pair, own, _fine(dem, own, params.max_footprint), gain, Placed.of(dem.meta)))
-    merged = merge(layers, lattice, params)
+    merged = merge(layers, lattice, params, inverse_depth_std)
     meta: MergeFacts = {
         "lattice": lattice.to_dict(),
         "frame": "world",

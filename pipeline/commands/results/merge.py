@@ -205,7 +205,7 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.log(first.ortho[first.lattice.window(common)] / ortho[lattice.window(common)])
         gain = math.exp(float(np.median(ratio[np.isfinite(ratio)]))) if np.isfinite(ratio).any() else 1.0
-    placed = Placed(session.centre[:2], np.diag([sigma[2], sigma[3], sigma[4]]) ** 2)
+    placed = Placed(session.centre, np.diag([sigma[2], sigma[3], sigma[4]]) ** 2)
     return _layer(number, lattice, {"elevation": height, "elevation_std": std, "ortho": ortho}, gain, placed)
 
 

@@ -78,8 +78,8 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
 MIN_YAW_SEGMENTS = 2
-"""Segments below which the prior of the yaw decides: two that agree; each says it far better than a turn says the
-numbers of a camera."""
+"""Segments that have to agree on a yaw before it is corrected; each says it far better than a turn says the numbers of
+a camera."""
 
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
@@ -298,7 +298,15 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
     )
 
 
-@stage("intrinsics", version=4)
+def inverse_depth_std(yaw: Sequence[float], baseline: float) -> float:
+    """Standard deviation, 1/m, of the error that all inverse depths share, by a yaw that is left and its own, rad.
+
+    In steps of the square root of two: maps stay in the cache while it changes by little.
+    """
+    return float(2.0 ** (round(2.0 * math.log2(math.hypot(*yaw) / baseline)) / 2.0))
+
+
+@stage("intrinsics", version=5)
 def intrinsics_stage(
     params: IntrinsicsParams,
     segments: Sequence[Bundle[ResectFacts]],
@@ -326,11 +334,12 @@ def intrinsics_stage(
         params.sigma,
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
-    shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_YAW_SEGMENTS]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta.get("changed") else MIN_YAW_PX) / focal
+    shown = np.array([part["yaw"] for part in parts]).reshape(-1, 2, 1)
+    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal
     # Any yaw is as likely: drawn to none by a prior, few segments that agree would seem to contradict each other.
     yaw = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
-    turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
+    agreed = yaw.wrong[0] and len(parts) >= MIN_YAW_SEGMENTS
+    turn, sigma = float(yaw.errors[0]) if agreed else 0.0, np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:
         correction = np.array([*np.zeros(CORRECTED), turn])
@@ -344,6 +353,8 @@ def intrinsics_stage(
         "correction": correction.tolist(),
         "corrected": composed(made, correction).tolist(),
     }
+    if parts and (made[-1] or rig.meta["changed"]):
+        facts["inverse_depth_std"] = inverse_depth_std(facts["yaw"], given.baseline)
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
     angle = yaw_contradiction(off, facts["yaw"][1], epipolar.angle_along(given), fixed=fixed)

@@ -176,6 +176,17 @@ def test_of_a_rig_that_was_repaired_no_yaw_is_known_before(changed):
     """The right camera was knocked: a yaw below half a pixel, which passes with a calibration, is corrected."""
     facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.3 / CAMERA.fx, changed=changed)
     assert facts["correction"][-1] * CAMERA.fx == pytest.approx(-0.3 * changed, abs=0.1)
+    assert ("inverse_depth_std" in facts) == changed
+
+
+def test_a_yaw_that_is_left_in_a_repaired_rig_is_in_its_sigma():
+    """Of some rigs that are off by less than is corrected, the error of inverse depth over its stated sigma."""
+    ratios = []
+    for yaw in (-0.09, -0.05, 0.05, 0.09):
+        facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=yaw / CAMERA.fx, changed=True)
+        left = yaw / CAMERA.fx + facts["correction"][-1]
+        ratios.append(left / abs(T_RIGHT_LEFT.translation[0]) / facts["inverse_depth_std"])
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
 def test_covariances_contain_the_errors_of_the_calibration():

@@ -37,7 +37,7 @@ def test_the_merge_reads_height_and_rotations_of_it() -> None:
     covariance = np.arange(36.0)
     meta = {"pose_covariance": covariance.tolist(), "T_frame_left": [1, 0, 0, 4, 0, 1, 0, 5, 0, 0, 1, 6]}
     placed = merge.Placed.of(meta)
-    assert placed.centre.tolist() == [4, 5]
+    assert placed.centre.tolist() == [4, 5, 6]
     assert placed.covariance.tolist() == [[14, 15, 16], [20, 21, 22], [26, 27, 28]]
 
 

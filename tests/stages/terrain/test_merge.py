@@ -11,6 +11,7 @@ from raising import raises
 from terrain_scenes import ArrayLayer
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
 from rille.stages.terrain.merge import (
@@ -194,10 +195,10 @@ def test_errors_of_poses_do_not_average_out() -> None:
     """Two models whose poses err together: simulated heights and tilts against the stated standard deviation."""
     rng = np.random.default_rng(5)
     root = np.array([[0.01, 0.0, 0.0], [0.004, 0.02, 0.0], [-0.003, 0.01, 0.03]])
-    pose = Placed(np.array([0.1, -0.7]), root @ root.T)
+    pose = Placed(np.array([0.1, -0.7, 0.0]), root @ root.T)
     layers = [replace(layer(k, 1.0, 1e-5), pose=pose) for k in range(2)]
     merged = merge(layers, TILE, PARAMS)
-    xy = TILE.xy() - pose.centre
+    xy = TILE.xy() - pose.centre[:2]
     errors = rng.normal(size=(20000, 3)) @ root.T
     found = errors[:, 0, None, None] + errors[:, 1, None, None] * xy[..., 1] - errors[:, 2, None, None] * xy[..., 0]
     np.testing.assert_allclose(merged.elevation_std, found.std(axis=0), rtol=0.03)
@@ -213,7 +214,20 @@ def test_a_rotation_moves_the_ground_as_its_covariance_says() -> None:
     meta |= {"T_frame_left": np.hstack([np.eye(3), [[0.2], [-0.1], [0.5]]]).ravel().tolist()}
     ahead = merge([replace(layer(0, 0.0, 1e-6), pose=Placed.of(meta))], TILE, PARAMS).elevation_std
     np.testing.assert_allclose(ahead, np.abs(TILE.xy()[..., 1] + 0.1) * 1e-2, atol=1e-6)
-    assert Placed.of({"T_frame_left": [0.0] * 12}) is EXACT
+    assert Placed.of({}) is EXACT
+
+
+def test_a_repaired_rig_moves_the_ground_along_its_rays() -> None:
+    """The same ground, intersected anew with inverse depths that are all off by as much."""
+    left = RigidTransform(np.array([[1.0, 0.0, 0.0], [0.0, -0.6, 0.8], [0.0, -0.8, -0.6]]), np.array([0.0, -3.0, 1.5]))
+    meta = {"T_frame_left": left.to_list()}
+    models = [replace(layer(k, 0.25, 1e-7), pose=Placed.of(meta)) for k in range(2)]
+    merged = merge(models, TILE, PARAMS, 1e-3)
+    ground = np.dstack([TILE.xy(), np.full(TILE.shape, 0.25)])
+    seen = left.inverse().apply(ground)
+    moved = left.apply(seen / (1.0 + 1e-3 * seen[..., 2:]))
+    np.testing.assert_allclose(merged.elevation_std, moved[..., 2] - ground[..., 2], rtol=0.01)
+    np.testing.assert_allclose(merged.relief_std, 1e-7 / np.sqrt(2), rtol=1e-6)
 
 
 def test_unsure_cells_are_left_undefined_on_request() -> None:
@@ -226,7 +240,7 @@ def test_unsure_cells_are_left_undefined_on_request() -> None:
     assert (merged.count[0] == 0).all()
     assert (merged.source[0] == -1).all()
     assert np.isfinite(merged.elevation[1:]).all()
-    drifting = Placed(np.zeros(2), np.diag([1.0, 0.0, 0.0]))
+    drifting = Placed(np.zeros(3), np.diag([1.0, 0.0, 0.0]))
     merged = merge([replace(one, pose=drifting)], TILE, MergeParams(max_std_cells=0.7))
     assert np.isfinite(merged.elevation[1:]).all(), "poses' part does not count"
 
