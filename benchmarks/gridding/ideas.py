@@ -33,7 +33,7 @@ IDEAS: tuple[tuple[str, dict[str, Any], Changes], ...] = (
     ("limit of the residual", {"max_residual": 1e9}, {}),
     ("limit of the standard deviation", {"max_std": 1e9}, {}),
     ("doubt beside hidden ground", {}, {(uncertainty, "HOLE_VARIANCE_PX2"): 0.0}),
-    ("doubt where cells moved", {}, {(uncertainty, "MOVE_FACTOR"): 0.0}),
+    ("doubt where cells moved", {}, {(uncertainty, "MIN_AREA_PX"): 1e9}),
     ("coarse to fine search", {}, {(solve, "COARSE_CELLS"): 1}),
 )
 """What is left out, in words, as parameters, and as constants of modules."""

@@ -242,7 +242,7 @@ class LocusInputs(NamedTuple):
 
 @stage(
     "locus",
-    version=5,
+    version=6,
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),

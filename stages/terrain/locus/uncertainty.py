@@ -3,7 +3,7 @@
 It is a sum of variances. With s the pixels of disparity a metre of elevation,
 
     (s sigma_Z)^2 = FLOOR_PX^2 + STEP_FACTOR t^2 / min(A, 1) + REST_FACTOR r^2 / I + (SHADE_FACTOR N / g)^2
-                    + (MOVE_FACTOR m)^2 + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2,
+                    + m^2 / A + HOLE_VARIANCE_PX2 u + (DIFFERENCE_FACTOR d)^2,
 
 times 2 - v where the ground turns away from the left camera, v < 1.
 
@@ -13,9 +13,10 @@ elevation that is wrong by as much of its step. r: what both images still differ
 the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the differences of
 the whole pair (robust), g: the grey value. In a shadow the gradients are those of noise, so the grey value stands for
 the contrast. m: how far the refinement moved the cells (RMS of 5 x 5 cells): the difference between the elevations by
-the disparity and by the images. u: the unknown share of 7 x 7 cells; a matching window beside hidden ground is the mean
-of two surfaces. d: the difference of both directions of matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX`
-where none of them has both; 0 where there was one direction.
+the disparity and by the images, which errs the more the fewer pixels those cells cover. u: the unknown share of 7 x 7
+cells; a matching window beside hidden ground is the mean of two surfaces. d: the difference of both directions of
+matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where there was one
+direction.
 
 v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen.
 Where v is small a matching window covers more ground, some of which hides other ground.
@@ -52,7 +53,8 @@ REST_FACTOR = 0.5
 """Of r^2 / I."""
 SHADE_FACTOR = 1.9
 """Of noise over grey value: what is left of the ground's contrast in the dark."""
-MOVE_FACTOR = 1.7
+MIN_AREA_PX = 0.1
+"""Squared pixels: below it a window of cells lies in one pixel, and tells no more or less than a larger one."""
 HOLE_VARIANCE_PX2 = 0.12
 """Squared pixels of disparity where all ground around is unknown."""
 DIFFERENCE_FACTOR = 0.87
@@ -102,9 +104,11 @@ def standard_deviation(
     variance = FLOOR_PX**2 + REST_FACTOR * _mean(np.square(rest), NEAR_SIDE_CELLS, near) / _gradients(
         seen, scale, known
     )
-    variance += np.square(SHADE_FACTOR * noise / grey) + MOVE_FACTOR**2 * _mean(moves, NEAR_SIDE_CELLS, near)
+    area = np.where(known, seen.area, np.float32(1.0))
+    variance += np.square(SHADE_FACTOR * noise / grey)
+    variance += _mean(moves, NEAR_SIDE_CELLS, near) / np.maximum(area, np.float32(MIN_AREA_PX))
     steps = _mean(_steps(elevation, scale, known), STEP_SIDE_CELLS, _count(known, STEP_SIDE_CELLS))
-    variance += STEP_FACTOR * steps / np.where(known, np.minimum(seen.area, 1.0), np.float32(1.0))
+    variance += STEP_FACTOR * steps / np.minimum(area, np.float32(1.0))
     variance += HOLE_VARIANCE_PX2 * (1.0 - _mean(known, HOLE_SIDE_CELLS, window_room(known.shape, HOLE_SIDE_CELLS)))
     if apart is not None:
         both = known & np.isfinite(apart)

@@ -8,8 +8,8 @@ from rille.stages.terrain.locus.uncertainty import (
     DIFFERENCE_FACTOR,
     FLOOR_PX,
     HOLE_VARIANCE_PX2,
+    MIN_AREA_PX,
     MIN_GRADIENT_POWER,
-    MOVE_FACTOR,
     ONE_SIDED_DIFFERENCE_PX,
     REST_FACTOR,
     SHADE_FACTOR,
@@ -60,7 +60,7 @@ def expected(
     variance += (
         (SHADE_FACTOR * noise / grey) ** 2
         + (DIFFERENCE_FACTOR * SCALE * apart) ** 2
-        + (MOVE_FACTOR * SCALE * moved) ** 2
+        + (SCALE * moved) ** 2 / max(area, MIN_AREA_PX)
     )
     return float(np.sqrt(variance) / SCALE)
 
@@ -70,11 +70,12 @@ def test_variances_add_up_as_by_hand(term: dict[str, float]) -> None:
     np.testing.assert_allclose(std(*ground(), **term)[20, 25], expected(**term), rtol=5e-3)
 
 
-@pytest.mark.parametrize("area", [0.1, 4.0])
-def test_a_step_counts_from_pixel_to_pixel_where_cells_are_finer(area: float) -> None:
+@pytest.mark.parametrize("area", [0.05, 0.2, 4.0])
+def test_steps_and_moves_count_by_the_pixels_of_a_cell(area: float) -> None:
     elevation, seen = ground()
     seen[4] = area
-    np.testing.assert_allclose(std(elevation, seen)[20, 25], expected(area=area), rtol=5e-3)
+    found = std(elevation, seen, moved=SHIFT)[20, 25]
+    np.testing.assert_allclose(found, expected(area=area, moved=SHIFT), rtol=5e-3)
 
 
 def test_each_part_counts() -> None:
@@ -128,7 +129,7 @@ def test_a_single_cell_speaks_for_itself() -> None:
         np.sqrt(
             FLOOR_PX**2
             + (DIFFERENCE_FACTOR * ONE_SIDED_DIFFERENCE_PX) ** 2
-            + (MOVE_FACTOR * SCALE * SHIFT) ** 2
+            + (SCALE * SHIFT) ** 2 / AREA
             + HOLE_VARIANCE_PX2 * 48 / 49
         )
         / SCALE,
