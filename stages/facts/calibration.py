@@ -10,7 +10,7 @@ class CalibrationFacts(Facts):
 
     rig: dict[str, Any]
     baseline: float
-    changed: NotRequired[bool]
+    changed: bool
 
 
 class OrientationFacts(Facts):

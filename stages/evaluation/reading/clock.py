@@ -55,7 +55,7 @@ class TruePositions:
     lever_arm: Floats | None = None
 
     @staticmethod
-    def of(d: Mapping[str, Any]) -> TruePositions:
+    def from_dict(d: Mapping[str, Any]) -> TruePositions:
         """From the JSON form of :class:`rille.datasets.protocol.Positions`."""
         values: Mapping[str, Any] = {name: np.array(v) if isinstance(v, list | tuple) else v for name, v in d.items()}
         return TruePositions(**values)

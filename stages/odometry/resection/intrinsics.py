@@ -64,8 +64,9 @@ STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
 
 
-MIN_SEGMENTS = 3
-"""Segments that turn, below which the prior decides."""
+MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
+"""Segments that turn, below which the prior of the cameras' numbers decides; and segments below which that of the yaw
+does, which each says far better."""
 
 MIN_ERROR = 0.0175
 """Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
@@ -76,10 +77,6 @@ MIN_CHANGE = 0.004
 MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
-
-MIN_YAW_SEGMENTS = 2
-"""Segments below which the prior of the yaw decides: two that agree; each says it far better than a turn says the
-numbers of a camera."""
 
 MIN_SIGMAS = 5.0
 """Standard deviations of the estimate from which on a prior is not believed."""
@@ -327,7 +324,7 @@ def intrinsics_stage(
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
     shown = np.array([part["yaw"] for part in parts if len(parts) >= MIN_YAW_SEGMENTS]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta.get("changed") else MIN_YAW_PX) / focal
+    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal
     # Any yaw is as likely: drawn to none by a prior, few segments that agree would seem to contradict each other.
     yaw = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
     turn, sigma = float(yaw.errors[0]) * bool(yaw.wrong[0]), np.sqrt(np.diag(common.covariance))
