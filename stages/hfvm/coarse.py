@@ -319,11 +319,7 @@ def turn(coarse: Coarse) -> Coarse:
         return coarse
     # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
-    turned = upright.anew(alignment=h)
-    # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
-    h = plane.refitted(sample(turned.images, turned.state), turned.state.level, left.shapes, h)
-    again = turned if h is None else upright.anew(alignment=h)
-    return max(coarse, turned, again, key=lambda tried: tried.share)
+    return max(coarse, upright.anew(alignment=h), key=lambda tried: tried.share)
 
 
 def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:
