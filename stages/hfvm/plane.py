@@ -43,15 +43,8 @@ class Sample(NamedTuple):
     v: AnyArray
 
 
-MIN_MATCHES = 60
-
 KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
-
-
-PLANE_TOLERANCE_PX = 1.0
-"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
-weight."""
 
 
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
@@ -59,7 +52,9 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
 
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
-    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    # 1.0 pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter
+    # of the weight.
+    fit = fit_points(sample, shapes[level], 1.0)
     # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
     # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
     if fit is None or fit[1] < (0.5 if few else 0.6):
@@ -166,7 +161,7 @@ def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, 
     (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
     """
     x, y, u, v = sample
-    if len(y) < MIN_MATCHES:
+    if len(y) < 60:
         return None
     # In half image sides all eight terms are of like size, so that one weak hold suits them all.
     scale = 0.5 * max(shape)
@@ -264,22 +259,20 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
 MAX_SIDE_PX = 1024
 """Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
 
-MIN_AGREEING = 15
-"""Keypoints that must agree; in unrelated images and under other suns 6 do."""
-
 
 def find_turn(left: Image, right: Image) -> Matrix | None:
     """Homography from left to right pixels (level 0) on which enough keypoints agree, or None."""
     levels = [_level(view) for view in (left, right)]
     layers = [view.layers[level] for view, level in zip((left, right), levels, strict=True)]
     p, q = matched_points(*(extract(layer.grey, layer.valid) for layer in layers))
-    if len(p) < MIN_AGREEING:
+    if len(p) < 15:
         return None
     # What relief does to a keypoint's place on the dominant surface.
     limit = 0.01 * max(right.shapes[levels[1]])
     h, agree = cv2.findHomography(p, q, cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
-    # 0.2: share of the unambiguous keypoints that must agree.
-    if h is None or agree.sum() < max(MIN_AGREEING, 0.2 * len(p)) or not _upright(h, left.shapes[levels[0]]):
+    # 0.2: share of the unambiguous keypoints that must agree, and 15 of them: 6 do in unrelated images and under other
+    # suns.
+    if h is None or agree.sum() < max(15, 0.2 * len(p)) or not _upright(h, left.shapes[levels[0]]):
         return None
     # Images of unlike size are looked at on levels of their own, so each side has its own scale.
     return np.asarray(finer(levels[1]) @ h @ np.linalg.inv(finer(levels[0])), dtype=np.float64)

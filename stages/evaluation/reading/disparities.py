@@ -6,12 +6,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats32
 
-MIN_MATCHES = 100
-"""Matches by which true disparities are doubted."""
-
-FITS_PX = 2.0
-"""Pixels: a match that is off by less fits the truth."""
-
 
 def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
     """How truth that contradicts most matches would fit them, in one line; empty where it fits, or nothing would.
@@ -22,7 +16,8 @@ def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
     readings: dict[str, Floats32] = {}
     for turned, rows in (("", truth), (" with its rows upside down", truth[::-1])):
         both = match & np.isfinite(column) & np.isfinite(rows) & (rows != 0)
-        if np.count_nonzero(both) < MIN_MATCHES:
+        # Of fewer matches true disparities are not doubted.
+        if np.count_nonzero(both) < 100:
             return ""
         factor, offset = np.median(column[both] / rows[both]), np.round(np.median((column - rows)[both]))
         readings |= {
@@ -30,8 +25,9 @@ def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
             f"times {factor:.2g}{turned}": rows * factor,
             f"{offset:+.0f} px{turned}": rows + offset,
         }
+    # 2.0 pixels: a match that is off by less fits the truth.
     fits = {
-        words: float(np.mean(np.abs(column - map_)[match & np.isfinite(map_)] < FITS_PX))
+        words: float(np.mean(np.abs(column - map_)[match & np.isfinite(map_)] < 2.0))
         for words, map_ in readings.items()
     }
     # Of readings that fit alike, as of a plane upside down, the plainest.

@@ -78,9 +78,6 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
-MIN_SIGMAS = 5.0
-"""Standard deviations of the estimate from which on a prior is not believed."""
-
 
 class IntrinsicsParams(Params):
     """Parameters of the stage ``intrinsics``."""
@@ -255,7 +252,8 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
             if matrix[i, i] > 0:
                 value, variance = np.linalg.solve(free, right)[i], np.linalg.inv(free)[i, i]
                 departure[i] = abs(value) / math.sqrt(variance) if abs(value) > least else 0.0
-        if departure.max() <= MIN_SIGMAS:
+        # 5.0: standard deviations of the estimate from which on a prior is not believed.
+        if departure.max() <= 5.0:
             return CommonErrors(errors, np.linalg.inv(matrix + prior), wrong)
         wrong[departure.argmax()] = True
 
