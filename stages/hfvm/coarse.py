@@ -137,6 +137,9 @@ MIN_FIT_PIXELS = 100
 MIN_GREY, MAX_GREY = 4.0, 250.0
 """Grey levels between which pixels are used for the ratio."""
 
+MIN_LOG_SCATTER = 0.05
+"""Least scatter of the logarithms of matched grey values."""
+
 MIN_LOG_RATIO = 0.1
 """Logarithm of the ratio that must be reached somewhere in the image for it to be corrected."""
 
@@ -190,7 +193,7 @@ def ratio_of_matches(left: Image, right: Image, state: State) -> Floats | None:
     y, x = thinned(state.left_ok, 4000)
     p, q = x + state.left.u[y, x].astype(np.int64), y + state.left.v[y, x].astype(np.int64)
     a, b = left.layers[state.level].grey[y, x], right.layers[state.level].grey[q, p]
-    # At MIN_GREY one grey level is a quarter of the value, five times the least scatter; at the top values are clipped.
+    # At MIN_GREY one grey level is a quarter of the value, five times MIN_LOG_SCATTER; at the top values are clipped.
     good = (np.minimum(a, b) > MIN_GREY) & (np.maximum(a, b) < MAX_GREY)
     if np.count_nonzero(good) < MIN_FIT_PIXELS:
         return None
@@ -204,8 +207,7 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 
     def weigh(off: AnyArray) -> AnyArray:
         # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        # 0.05: least scatter of the logarithms of matched grey values.
-        return cauchy(off, max(0.05, 1.5 * epipolar.typical(off)))
+        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * epipolar.typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
     hold = 1e-3 * target.size * np.eye(len(basis))
@@ -317,7 +319,11 @@ def turn(coarse: Coarse) -> Coarse:
         return coarse
     # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
-    return max(coarse, upright.anew(alignment=h), key=lambda tried: tried.share)
+    turned = upright.anew(alignment=h)
+    # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
+    h = plane.refitted(sample(turned.images, turned.state), turned.state.level, left.shapes, h)
+    again = turned if h is None else upright.anew(alignment=h)
+    return max(coarse, turned, again, key=lambda tried: tried.share)
 
 
 def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:

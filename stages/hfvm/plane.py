@@ -7,7 +7,8 @@ matches and distorts windows noticeably, the right image is resampled by its hom
 matches say how: no calibration is used, and displacements are given in the original images.
 
 Beyond a turn of some 20 degrees or a scale of 1.3 coarse matching finds nothing. There keypoints that carry their own
-orientation and scale (:mod:`rille.stages.imaging.features`) give the homography."""
+orientation and scale (SIFT, Lowe 2004; compared by the square roots of their histograms, Arandjelovic and Zisserman
+2012) give the homography."""
 
 from __future__ import annotations
 
@@ -26,7 +27,6 @@ from rille.stages.geometry.cubic import cubic
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Layer, Shape, Window
-from rille.stages.imaging.features import extract, matched_points
 from rille.stages.imaging.pyramid import filled_from
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -43,8 +43,15 @@ class Sample(NamedTuple):
     v: AnyArray
 
 
+MIN_MATCHES = 60
+
 KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
+
+
+PLANE_TOLERANCE_PX = 1.0
+"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
+weight."""
 
 
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
@@ -52,9 +59,7 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
 
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
-    # 1.0 pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter
-    # of the weight.
-    fit = fit_points(sample, shapes[level], 1.0)
+    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
     # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
     # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
     if fit is None or fit[1] < (0.5 if few else 0.6):
@@ -65,6 +70,12 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
     # 3.0: shear or stretch, pixels per pixel, from which on the plane is no ground but a bad fit; views turned by 180
     # degrees have 2, and more if scaled.
     return h if 0.2 <= shear < 3.0 else None
+
+
+def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
+    """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
+    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
 
 
 def aligned(right: Image, h: Matrix, left: Image) -> Image:
@@ -161,7 +172,7 @@ def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, 
     (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
     """
     x, y, u, v = sample
-    if len(y) < 60:
+    if len(y) < MIN_MATCHES:
         return None
     # In half image sides all eight terms are of like size, so that one weak hold suits them all.
     scale = 0.5 * max(shape)
@@ -259,20 +270,25 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
 MAX_SIDE_PX = 1024
 """Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
 
+MIN_CONTRAST = 0.02
+"""Least contrast of a keypoint; half of OpenCV's default, for sand and haze."""
+
+MIN_AGREEING = 15
+"""Keypoints that must agree; in unrelated images and under other suns 6 do."""
+
 
 def find_turn(left: Image, right: Image) -> Matrix | None:
     """Homography from left to right pixels (level 0) on which enough keypoints agree, or None."""
     levels = [_level(view) for view in (left, right)]
-    layers = [view.layers[level] for view, level in zip((left, right), levels, strict=True)]
-    p, q = matched_points(*(extract(layer.grey, layer.valid) for layer in layers))
-    if len(p) < 15:
+    (p, a), (q, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
+    first, second = _alike(a, b)
+    if len(first) < MIN_AGREEING:
         return None
     # What relief does to a keypoint's place on the dominant surface.
     limit = 0.01 * max(right.shapes[levels[1]])
-    h, agree = cv2.findHomography(p, q, cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
-    # 0.2: share of the unambiguous keypoints that must agree, and 15 of them: 6 do in unrelated images and under other
-    # suns.
-    if h is None or agree.sum() < max(15, 0.2 * len(p)) or not _upright(h, left.shapes[levels[0]]):
+    h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
+    # 0.2: share of the unambiguous keypoints that must agree.
+    if h is None or agree.sum() < max(MIN_AGREEING, 0.2 * len(first)) or not _upright(h, left.shapes[levels[0]]):
         return None
     # Images of unlike size are looked at on levels of their own, so each side has its own scale.
     return np.asarray(finer(levels[1]) @ h @ np.linalg.inv(finer(levels[0])), dtype=np.float64)
@@ -281,6 +297,32 @@ def find_turn(left: Image, right: Image) -> Matrix | None:
 def _level(view: Image) -> int:
     """Finest level whose longer side is at most :data:`MAX_SIDE_PX`, else the coarsest."""
     return next((n for n, shape in enumerate(view.shapes) if max(shape) <= MAX_SIDE_PX), len(view.shapes) - 1)
+
+
+def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
+    layer = view.layers[level]
+    grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
+    # Comparing all keypoints with all takes their number squared.
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
+    points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
+    if not points:
+        return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
+    total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
+    # Roots of shares have length one, and their Euclidean distance is Hellinger's between the histograms.
+    return np.array([point.pt for point in points], np.float32), np.sqrt(histograms / total)
+
+
+def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of descriptors (n, 128) of which each is the other's nearest, by far."""
+    if len(a) < 2 or len(b) < 2:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    back = [m.trainIdx for (m,) in matcher.knnMatch(b, a, k=1)]
+    near = matcher.knnMatch(a, b, k=2)
+    # Lowe's (2004): the nearest keypoint is nearer by this factor than the second nearest.
+    kept = [m for m, n in near if m.distance < 0.8 * n.distance and back[m.trainIdx] == m.queryIdx]
+    return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
 
 
 def _upright(h: Matrix, shape: Shape) -> bool:

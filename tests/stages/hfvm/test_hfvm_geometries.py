@@ -90,6 +90,15 @@ def on_plane(h, share=1.0, level=2):
     return Sample(x, y, u, v), [SHAPE, (100, 120), shape]
 
 
+def test_an_alignment_is_corrected_by_the_matches_that_it_makes():
+    h = np.array([[1.0, 0.4, -9.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    rest = np.array([[1.02, 0.1, 3.0], [0.01, 1.0, -2.0], [0.0, 0.0, 1.0]])
+    matches, shapes = on_plane(rest)
+    found = plane.refitted(matches, 2, shapes, h)
+    wanted = plane.to_original(h, SHAPE) @ rest
+    np.testing.assert_allclose(found / found[2, 2], wanted / wanted[2, 2], atol=0.01)
+
+
 def test_of_few_matches_fewer_need_lie_on_the_plane():
     matches, shapes = on_plane(np.array([[1.0, 0.5, -9.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), share=0.5)
     assert plane.find(matches, 2, shapes) is None
