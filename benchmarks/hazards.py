@@ -87,7 +87,7 @@ def path_of(scene: Any, exact: Any, found: Any) -> dict[str, Any]:
 
     path = find_path(found, scene.lattice, scene.vehicle, stretch=True)
     true = shortest(path.xyz, exact, scene.wide, scene.vehicle)
-    crossed = path_check(path.xyz, exact["risk"], scene.wide)[1]
+    crossed = path_check(path.xyz, exact["risk"], scene.wide)
     values = {name: m["value"] for name, m in (true | crossed).items()}
     return {"planner": path.planner, "ground": path.ground, **values}
 

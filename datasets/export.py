@@ -102,10 +102,7 @@ def _write_image(folder: Path, camera: str, name: str, bundle: Bundle) -> None:
 
 def _write_png(path: Path, image: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(".png", image)
-    if not done:
-        raise InputError("RIL-167", f"{path} cannot be encoded as PNG")
-    path.write_bytes(data.tobytes())
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 def _write_rows(path: Path, rows: Iterable[Iterable[float]]) -> None:

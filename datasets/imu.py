@@ -46,9 +46,6 @@ HALF_WINDOW = 1.0
 """s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
 flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; half the window triples that."""
 
-BRIDGE = 0.1
-"""s; longest gap in the samples over which the rate is interpolated."""
-
 GAP = 2.5
 """The same of a slow sensor, in median spacings: one missing sample (2) is common, more is not."""
 
@@ -242,8 +239,9 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:
     """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
     usual = float(np.median(np.diff(imu.times)))
-    # A slow sensor's usual spacing is no gap, even where it exceeds BRIDGE.
-    bridge = max(BRIDGE, GAP * usual)
+    # A slow sensor's usual spacing is no gap, even where it exceeds this.
+    # 0.1 s: longest gap in the samples over which the rate is interpolated.
+    bridge = max(0.1, GAP * usual)
     near = np.flatnonzero((imu.times >= start - bridge) & (imu.times <= end + bridge))
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(imu.times[near]) > bridge) + 1):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import pkgutil
 import shlex
@@ -29,7 +28,7 @@ from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.reading import Search, is_broken
 from rille.datasets.text.validation import Model, validated
-from rille.stages.core.errors import ConfigError, InputError, RilleError
+from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean
 
 BUILT_IN: dict[str, tuple[str, Mapping[str, Any]]] = {
     "mockup": ("the paper's experiment, simulated: 40 pairs over a lunar bed at 1:10, with exact truth", {}),
@@ -131,7 +130,10 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
         kind = "file" if path.suffix else "sequence"
         gone = is_broken(path) and f"it is a link to {os.readlink(path)}, which is missing"
-        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=gone or _suggestion(name_or_path))
+        known = [*BUILT_IN, *MANIFESTS]
+        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
+        remedy = gone or f"{meant} known names: {', '.join(known)}"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # What the user wrote down goes before what the folder looks like.
@@ -200,9 +202,3 @@ def _split(name_or_path: str) -> tuple[Path, str | None]:
     if not os.path.exists(path) and colon and root:
         return Path(os.path.expanduser(root)), number
     return path, None
-
-
-def _suggestion(name: str) -> str:
-    near = difflib.get_close_matches(name, [*BUILT_IN, *MANIFESTS], n=1, cutoff=0.5)
-    known = f"known names: {', '.join([*BUILT_IN, *MANIFESTS])}; or give a folder or a manifest"
-    return f"did you mean {near[0]!r}? {known}" if near else known

@@ -11,9 +11,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
-CLEARLY = 4.0
-"""Times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was cut."""
-
 MAX_OFF_CENTRE = 0.1
 """Share of an image's width by which a principal point usually lies off the centre at most."""
 
@@ -115,7 +112,9 @@ def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
     """Refuse a camera whose principal point is the centre of its images, of this size, if cx and cy are exchanged."""
     c = camera.lens.camera
     off, exchanged = (max(abs(x - width / 2), abs(y - height / 2)) for x, y in ((c.cx, c.cy), (c.cy, c.cx)))
-    if off > max(CLEARLY * exchanged, 0.5 * MAX_OFF_CENTRE * width):
+    # 4.0: times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was
+    # cut.
+    if off > max(4.0 * exchanged, 0.5 * MAX_OFF_CENTRE * width):
         text = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name} would be the centre of"
         remedy = "exchange them; or, if the images were turned, turn them back"
         raise InputError("RIL-133", f"{text} {width} x {height} images if cx and cy were exchanged", remedy=remedy)

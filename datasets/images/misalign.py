@@ -22,9 +22,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.lens import Lens
 
-KERNEL = 4
-"""Pixels along either side that cubic interpolation reads."""
-
 
 class MisalignParams(Params):
     """How the right camera is knocked; all 0: not at all."""
@@ -116,7 +113,8 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
     top = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else np.inf
     values = np.clip(np.rint(values) if np.isfinite(top) else values, 0, top)
     # A cubic spline reads 4 x 4 pixels: one that is not usable spoils all places that read it.
-    kernel = np.ones((KERNEL, KERNEL), np.uint8)
+    # 4: pixels along either side that cubic interpolation reads.
+    kernel = np.ones((4, 4), np.uint8)
     whole = cv2.erode(
         (valid != 0).astype(np.uint8), kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0
     )

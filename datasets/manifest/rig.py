@@ -21,9 +21,6 @@ from rille.stages.geometry.lens import Lens
 LONGEST_BASELINE = 20.0
 """m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
 
-MAX_OFF_CENTRE_OF_UNKNOWN_SIZE = 0.04
-"""The same as ``MAX_OFF_CENTRE`` where a calibration states no size: then images that were cut show by nothing else."""
-
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
 
@@ -234,7 +231,9 @@ def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: S
             text = f"{side} camera: fx = {c.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
             lines.append(warning("RIL-690", text))
         off = max(abs(c.cx - width / 2), abs(c.cy - height / 2)) / width
-        if off > (MAX_OFF_CENTRE_OF_UNKNOWN_SIZE if calibrated.size is None else MAX_OFF_CENTRE):
+        # 0.04: the limit where a calibration states no size: then images that were cut show by
+        # nothing else.
+        if off > (0.04 if calibrated.size is None else MAX_OFF_CENTRE):
             place = (
                 f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height} images"
             )

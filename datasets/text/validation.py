@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
@@ -10,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from rille.stages.core.declare import Params
-from rille.stages.core.errors import ConfigError, InputError, RilleError, told
+from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean, told
 
 Model = TypeVar("Model", bound=Params)
 
@@ -67,13 +66,12 @@ def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
 
 
 def _nearest(key: str, known: list[str]) -> str:
-    """The key that may have been meant: of the same table, or of the same name in another one."""
-    table, _, last = key.rpartition(".")
+    """The key that may have been meant: of the same name in another table, or of the same table."""
+    table, dot, last = key.rpartition(".")
     beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == table]
-    near = [f"{table}.{name}".lstrip(".") for name in difflib.get_close_matches(last, beside, n=1)]
     elsewhere = [k for k in known if k.rpartition(".")[2] == last]
-    meant = next(iter([*elsewhere, *near]), None)
-    return f"did you mean {meant!r}?" if meant else f"known here are {', '.join(sorted(beside))}"
+    meant = did_you_mean(elsewhere[0], elsewhere) if elsewhere else did_you_mean(last, beside, table + dot)
+    return meant or f"known here are {', '.join(sorted(beside))}"
 
 
 def known_keys(kind: type[Params], prefix: str = "") -> Iterable[str]:

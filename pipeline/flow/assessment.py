@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from rille.datasets.protocol import Positions
 from rille.pipeline.engine.graph import Handle, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair
@@ -37,20 +36,22 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
     if p.crosscheck is not None:
         p.agreement = make.node(agreement_stage, "agreement", trajectory=p.trajectory, crosscheck=p.crosscheck)
     if s.truth_positions is not None:
-        given = _positions(make, s.truth_positions, frames)
+        true, moments = s.truth_positions.to_dict(), s.times and [s.times[f] for f in frames]
+        if s.truth_positions.times is None:
+            true["positions"], moments = [s.truth_positions.positions[f] for f in frames], None
+        given = {"truth": true, "moments": moments, "frames": list(frames)}
         p.position_accuracy = make.node(position_accuracy_stage, "position_accuracy", trajectory=p.trajectory, **given)
     poses = [None if (pose := _truth(make, f)) is None else pose.to_list() for f in frames]
     # No task for no truth: the report then says that there is none, not that it failed.
     if any(poses):
         known = {"truth": poses, "frames": list(frames)}
-        mount = s.truth_mount and s.truth_mount.to_list()
-        record = s.truth_record
-        own = {
-            "mount": mount,
-            "sigmas": {"sigma_m": s.truth_sigma_m, "sigma_rad": s.truth_sigma_rad},
-            "record": record and _positions(make, record, frames),
+        source = {
+            "mount": (s.truth_mount or RigidTransform.identity()).to_list(),
+            "sigmas": [s.truth_sigma_m, s.truth_sigma_rad],
+            "record": s.truth_record and s.truth_record.to_dict(),
+            "moments": s.times and [s.times[f] for f in frames],
         }
-        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, **own, **known)
+        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, source=source, **known)
         if p.crosscheck is not None:
             p.crosscheck_accuracy = make.node(accuracy_stage, "accuracy/crosscheck", trajectory=p.crosscheck, **known)
 
@@ -93,17 +94,6 @@ def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
 
 def _truth(make: Builder, frame: int) -> RigidTransform | None:
     return None if make.sequence.truth is None else make.sequence.truth[frame]
-
-
-def _positions(make: Builder, true: Positions, frames: Sequence[int]) -> dict[str, Any]:
-    """Arguments of the comparison with true positions: of the chosen frames, where rows are frames."""
-    s = make.sequence
-    truth, moments = true.to_dict(), None
-    if true.times is None:
-        truth["positions"] = [true.positions[f] for f in frames]
-    elif s.times is not None:
-        moments = [s.times[f] for f in frames]
-    return {"truth": truth, "moments": moments, "frames": list(frames)}
 
 
 def _truth_dem(

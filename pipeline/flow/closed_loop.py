@@ -107,12 +107,6 @@ class DriveParams(Params):
         description="stops after which the drive is given up; a path of 2.8 m among many rocks took more than 60",
     )
     max_safety_stops: int = Field(default=3, ge=1, description="successive safety stops that end the drive")
-    least_match: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="share of an image's pixels that must match the image before; with fewer the image counts as lost",
-    )
 
 
 def arena(goal: tuple[float, float], around: float, cell: float) -> Lattice:
@@ -393,7 +387,8 @@ class Drive:
 
     def _kept(self, stop: Stop, rows: dict[int, int], rate: list[float]) -> list[int]:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
-        frames, least = list(rows), self.config.drive.least_match
+        # Less than a tenth of its pixels match the image before: it is lost.
+        frames, least = list(rows), 0.1
         lost = [b for n, b in enumerate(frames[1:]) if rate[n] < least and (n + 1 == len(rate) or rate[n + 1] < least)]
         if lost:
             shares = ", ".join(f"{b} ({rate[frames.index(b) - 1]:.0%} matched)" for b in lost)

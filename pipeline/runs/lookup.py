@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.plain import some
-from rille.stages.core.errors import ConfigError, RilleError
+from rille.stages.core.errors import ConfigError, RilleError, did_you_mean
 
 LEDGER = "ledger.jsonl"
 
@@ -78,7 +77,7 @@ def find(text: str, runs: Path) -> Path:
         return started[-1].resolve()
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
-    raise ConfigError("RIL-067", f"no run {text!r}", remedy=near(text, names) or where)
+    raise ConfigError("RIL-067", f"no run {text!r}", remedy=did_you_mean(text, names) or where)
 
 
 def elevation(text: str, runs: Path) -> Path:
@@ -104,14 +103,7 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
     if label in by_label:
         return by_label[label]
     text = f"run {name(run)} has no task {label!r}"
-    raise ConfigError("RIL-068", text, remedy=near(label, by_label) or f"it has {some(list(by_label), 4)}")
-
-
-def near(text: str, names: Iterable[str]) -> str:
-    """The question whether one of the names that are like a text was meant; empty where none is."""
-    known = list(dict.fromkeys(names))
-    alike = difflib.get_close_matches(text, known, n=3, cutoff=0.5) or [n for n in known if text and text in n][:3]
-    return f"did you mean {' or '.join(alike)}?" if alike else ""
+    raise ConfigError("RIL-068", text, remedy=did_you_mean(label, by_label) or f"it has {some(list(by_label), 4)}")
 
 
 def refuse_unknown(option: str, given: Iterable[str], known: Collection[str], what: str) -> None:
@@ -123,7 +115,7 @@ def refuse_unknown(option: str, given: Iterable[str], known: Collection[str], wh
         One of those ``given`` is none of the ``known``; the message has the nearest names, or all.
     """
     for name in sorted(set(given).difference(known)):
-        hint = near(name, known) or f"one of {', '.join(sorted(known))}"
+        hint = did_you_mean(name, known) or f"one of {', '.join(sorted(known))}"
         raise ConfigError("RIL-035", f"{option} {name!r} is no {what}", remedy=hint)
 
 

@@ -45,9 +45,8 @@ from rille.stages.geometry.geometry import Rig
 
 ANGLES = 3
 
-BEYOND = 1.0
 BEYOND_SHARE = 0.1
-"""Share of matches more than ``BEYOND`` pixels beyond infinity from which on depth is wrong; a sky has fewer."""
+"""Share of matches more than a pixel beyond infinity from which on depth is wrong; a sky has fewer."""
 
 
 SYSTEMATIC_PX = 0.1
@@ -307,7 +306,7 @@ class _Chooser:
 def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit) -> float:
     """Share of the matches, outliers aside, that lie beyond infinity."""
     beyond = np.concatenate([beyond_infinity(rig, m.left, m.right) for m in pairs])
-    return float(np.mean(beyond[np.concatenate(fit.weights) > 0] > BEYOND))
+    return float(np.mean(beyond[np.concatenate(fit.weights) > 0] > 1.0))
 
 
 def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:

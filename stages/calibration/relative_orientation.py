@@ -38,9 +38,6 @@ SIZE = RIG + PRINCIPAL + len(TERMS)
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Angles, and the coordinate of the principal point that looks like each."""
 
-EXACT_RAD = 1e-7
-"""Standard deviation [rad] of a parameter that is held exactly."""
-
 MIN_MATCHES = 50
 
 BLOCKS = 6
@@ -142,7 +139,8 @@ def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: 
     part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
     """
     # A smooth error that is as good as held at none.
-    none = replace(priors, rotation=EXACT_RAD, baseline=EXACT_RAD, systematic=3e-3)
+    # 1e-7: standard deviation [rad] of a parameter that is held exactly.
+    none = replace(priors, rotation=1e-7, baseline=1e-7, systematic=3e-3)
     return _adjust(rig, pairs, precision(free, none, rival=False))
 
 

@@ -53,13 +53,6 @@ from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
 from rille.stages.numeric.robust import mad_sigma
 
-BAD_ROWS_PX = 1.0
-"""Residual [pixels of the coarser image] after the repair from which on it is doubted: RMS of all pairs, lens
-distortion or a wrong calibration; spread of one, its images may be of two moments."""
-
-MAX_TURN_DEG = 5.0
-"""Largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a baseline."""
-
 
 class RigParams(RelativeParams):
     """Parameters of the stage ``rig``."""
@@ -113,7 +106,9 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
-    far = turned or any(abs(math.degrees(p.value)) > MAX_TURN_DEG for p in decision.parameters)
+    # 5.0: largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a
+    # baseline.
+    far = turned or any(abs(math.degrees(p.value)) > 5.0 for p in decision.parameters)
     applied = params.mode != "fixed" and decision.changed and not far
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
@@ -132,7 +127,9 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
         words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"
         warnings = [f"{words} against the left ones, which the calibration does not say: turn them back"]
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
-    bad_rows = right_pixels(given) * BAD_ROWS_PX
+    # A pixel of the coarser image is left after the repair: RMS of all pairs, lens distortion or a wrong calibration;
+    # spread of one, its images may be of two moments.
+    bad_rows = right_pixels(given)
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > bad_rows]
     marks |= {"suspects": suspects} if suspects else {}
     warnings += [] if turned else _doubts(share, after, bad_rows)
@@ -243,7 +240,7 @@ def _contradiction(given: Rig, offset: float, decision: Decision, done: str, hid
 
 
 def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
-    """Signs that something other than the rig's orientation is wrong; ``bad_rows``: see :data:`BAD_ROWS_PX`."""
+    """Signs that something other than the rig's orientation is wrong: a residual above ``bad_rows``, pixels, say."""
     lines = []
     if residual > bad_rows:
         lines.append(

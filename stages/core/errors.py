@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import difflib
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Self
 
 
@@ -30,6 +31,13 @@ class RilleError(Exception):
     def at(self, where: str) -> Self:
         """Return the same error with the place in front: ``where: message``."""
         return type(self)(self.code, f"{where}: {self.message}", remedy=self.remedy)
+
+
+def did_you_mean(text: str, names: Iterable[str], prefix: str = "") -> str:
+    """The question whether one of the names that are like a text was meant, with a prefix; empty where none is."""
+    known = list(dict.fromkeys(names))
+    alike = difflib.get_close_matches(text, known, n=3, cutoff=0.6) or [n for n in known if text and text in n][:3]
+    return f"did you mean {' or '.join(prefix + name for name in alike)}?" if alike else ""
 
 
 def _rebuild(kind: type[RilleError], code: str, message: str, remedy: str) -> RilleError:

@@ -38,9 +38,6 @@ MODEL_RADIUS_WHEELS = 0.5
 """A point is compared with the greatest height of the model within this radius [wheel diameters]."""
 LEVEL = 1
 """Pyramid level of the displacements: half the resolution."""
-MAX_TURN_DEG = 6.0
-"""Largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that the model had
-right."""
 MIN_RISE_WHEELS, MIN_RISE_SIGMAS = 0.25, 2.0
 """Rise over the model from which a point counts as raised [wheel diameters], and standard deviations of it."""
 MIN_POINTS, MIN_SHARE = 8, 0.35
@@ -255,7 +252,9 @@ def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:
     for j in range(1, len(odometry)):
         # From the latest backwards: the first image far enough behind is the most alike.
         for i in range(j - 1, -1, -1):
-            if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > MAX_TURN_DEG:
+            # 6.0: largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that
+            # the model had right.
+            if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > 6.0:
                 break
             # 1.6: distance driven between the two compared images [wheel diameters]; larger: less noise.
             if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= 1.6 * wheel - 1e-9:

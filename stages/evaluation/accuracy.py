@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,23 @@ CLAIMS = (
     ("nees_rotation", slice(3, 6), ", of rotations alone"),
 )
 """Figures of the covariances: name, rows of a covariance that are judged, and what they are in words."""
+
+
+class TruthSource(NamedTuple):
+    """Of the file of true poses: ``mount``, T_body_left, by which its poses were multiplied; ``sigmas`` of them, m and
+    rad; ``record``, positions at times of its own, and ``moments`` (frame,), s, of the images.
+    """
+
+    mount: RigidTransform = RigidTransform.identity()
+    sigmas: tuple[float, float] = (0.0, 0.0)
+    record: TruePositions | None = None
+    moments: Sequence[float] | None = None
+
+    @staticmethod
+    def from_dict(d: Mapping[str, Any]) -> TruthSource:
+        """From its JSON form."""
+        record = d["record"] and TruePositions.from_dict(d["record"])
+        return TruthSource(RigidTransform.from_matrix(d["mount"]), d["sigmas"], record, d["moments"])
 
 
 def trajectory_accuracy(
@@ -198,36 +215,29 @@ def accuracy_stage(
     *,
     frames: list[int],
     truth: Sequence[Sequence[float] | None],
-    mount: RigidTransform | None = None,
-    sigmas: Mapping[str, float] | None = None,
-    record: Mapping[str, Any] | None = None,
+    source: TruthSource | None = None,
 ) -> Bundle[AccuracyFacts]:
-    """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES.
-
-    ``sigmas``: of the truth itself, ``sigma_m`` and ``sigma_rad``. ``record``: its positions (row, 3), m, at
-    ``times`` of its own, s, as for :mod:`rille.stages.evaluation.position_accuracy`.
-    """
-    given, true = trajectory.meta["frames"], pose_rows(truth)
+    """Trajectory against the true poses of some frames: ATE, RPE, drift, scale, NEES."""
+    given, true, source = trajectory.meta["frames"], pose_rows(truth), source or TruthSource()
     estimate, claimed = rigid.by_frame(world_poses(trajectory), given, frames), None
     if "covariance" in trajectory.arrays:
         claimed = rigid.by_frame(np.asarray(trajectory["covariance"]), given, frames)
-    arrays, figures = trajectory_accuracy(estimate, true, claimed, **(sigmas or {}))
+    arrays, figures = trajectory_accuracy(estimate, true, claimed, *source.sigmas)
     facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
         stated = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
-        body = mount or RigidTransform.identity()
-        warnings = better_reading(estimate[both], true[both], body, stated)
+        warnings = better_reading(estimate[both], true[both], source.mount, stated)
         off = None if warnings else hand_eye(estimate, true)
         late = None
-        if record is not None and not warnings:
-            late = late_truth(np.array(record["moments"]), estimate[:, :, 3], TruePositions.of(record["truth"]))
+        if source.record is not None and not warnings:
+            late = late_truth(np.array(source.moments), estimate[:, :, 3], source.record)
         if off is not None:
-            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, **(sigmas or {}))
+            _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, *source.sigmas)
             left = float(without["ate_rmse"]["value"] or 0.0)
             # A lever arm ahead and a clock look alike, but for turns.
             if late is None or left <= late.error:
-                late, warnings = None, [misplaced(off, body, figures, without)]
+                late, warnings = None, [misplaced(off, source.mount, figures, without)]
                 figures |= without_it(off, without)
         if late is not None:
             as_given = f"as given {figures['ate_rmse']['value']:.2g} m"

@@ -22,7 +22,6 @@ from rille.stages.terrain.relief.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, F
 
 Align = Literal["shift", "tilt", "rigid"]
 
-BORDER = 1e-6  # of a coarse cell: a centre nearer than this to a border lies on it
 FREE = {"shift": [0, 1, 2], "tilt": [2, 3, 4], "rigid": [0, 1, 2, 3, 4, 5]}  # of tx ty tz wx wy wz
 MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
 
@@ -39,7 +38,8 @@ def cell_means(fine: Grid, target: Grid) -> Floats:
     count, total = np.zeros(size), np.zeros(size)
     # Lattices of which one has twice the cells of the other put centres on borders: rounded to one side, they would
     # shift the means, or leave every other cell nearly without any. Moved to all four sides, they are shared out.
-    for nudge in itertools.product((-BORDER, BORDER), repeat=2):
+    # 1e-6 of a coarse cell: a centre nearer than this to a border lies on it.
+    for nudge in itertools.product((-1e-6, 1e-6), repeat=2):
         index = np.rint(where + nudge).astype(np.intp)
         inside = ((index >= 0) & (index < shape)).all(axis=1)
         flat = np.ravel_multi_index((index[inside, 0], index[inside, 1]), shape)

@@ -13,14 +13,9 @@ from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
 from rille.stages.evaluation.coverage import within
+from rille.stages.evaluation.reading.disparities import misread
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
-
-MIN_MATCHES = 100
-"""Matches by which true disparities are doubted."""
-
-FITS_PX = 2.0
-"""Pixels: a match that is off by less fits the truth."""
 
 
 def filled(column: Floats32, match: Bools) -> Floats32:
@@ -71,38 +66,6 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
     return figures | within(error, sigma[both], f"of the disparity, {of_matched}")
-
-
-def misread(column: Floats32, match: Bools, truth: Floats32) -> str:
-    """How truth that contradicts most matches would fit them, in one line; empty where it fits, or nothing would.
-
-    It may have another sign or unit (SGBM counts in sixteenths), an offset (principal points that differ), or its
-    lowest row first, as PFM has.
-    """
-    readings: dict[str, Floats32] = {}
-    for turned, rows in (("", truth), (" with its rows upside down", truth[::-1])):
-        both = match & np.isfinite(column) & np.isfinite(rows) & (rows != 0)
-        if np.count_nonzero(both) < MIN_MATCHES:
-            return ""
-        factor, offset = np.median(column[both] / rows[both]), np.round(np.median((column - rows)[both]))
-        readings |= {
-            f"as it is{turned}": rows,
-            f"times {factor:.2g}{turned}": rows * factor,
-            f"{offset:+.0f} px{turned}": rows + offset,
-        }
-    fits = {
-        words: float(np.mean(np.abs(column - map_)[match & np.isfinite(map_)] < FITS_PX))
-        for words, map_ in readings.items()
-    }
-    # Of readings that fit alike, as of a plane upside down, the plainest.
-    as_given, best = fits["as it is"], next(words for words in fits if fits[words] > max(fits.values()) - 0.02)
-    # Of right matches most fit; of wrong ones half do not by any reading.
-    if as_given > 0.25 or fits[best] < 0.5:
-        return ""
-    return (
-        f"the true disparities contradict the matches: {as_given:.0%} of these fit them, and {fits[best]:.0%} if they "
-        f"are read {best}; check truth_disparity: sign, unit, order of rows, and that each is of its left image"
-    )
 
 
 @stage(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
-from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.geometry.geometry import way_length
 from rille.stages.geometry.lattice import Lattice
@@ -31,8 +31,8 @@ def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
     return np.unique(np.rint(lattice.index(points)).astype(np.int64), axis=0)
 
 
-def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> tuple[NDArray[np.int64], dict[str, Metric]]:
-    """Crossed hazardous cells (n, 2) row, column, and metrics by name.
+def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> dict[str, Metric]:
+    """Metrics by name.
 
     Parameters
     ----------
@@ -42,16 +42,15 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> tuple[NDArray[np.
     truth = "in the risk map of the exact elevations, same vehicle"
     share = metric(float((risk == HAZARDOUS).mean()), "1", f"hazardous share of all cells {truth}")
     if len(path) == 0:
-        return np.empty((0, 2), dtype=np.int64), {"hazardous_share": share}
+        return {"hazardous_share": share}
     cells = crossed_cells(path, lattice)
     inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
     # What lies beyond the exact map counts as unknown, like its holes.
     kinds = np.full(len(cells), UNKNOWN, dtype=np.uint8)
     kinds[inside] = risk[cells[inside, 0], cells[inside, 1]]
-    hit = cells[kinds == HAZARDOUS]
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    return hit, {
-        "hazard_cells": metric(len(hit), "cells", f"crossed cells that are hazardous {truth}"),
+    return {
+        "hazard_cells": metric(int((kinds == HAZARDOUS).sum()), "cells", f"crossed cells that are hazardous {truth}"),
         "unknown_cells": metric(int((kinds == UNKNOWN).sum()), "cells", f"crossed cells that are unknown {truth}"),
         "crossed_cells": metric(len(cells), "cells", "cells that the path crosses"),
         "path_length": metric(length, "m", "length of the path, climbs included"),
@@ -97,15 +96,11 @@ def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> f
     return float(cost[last]) * COST_UNIT_M if cost[last] < UNREACHED else None
 
 
-@stage(
-    "path_check",
-    version=2,
-    outputs=[Array("hazard_cell", ("cell", "rowcol"), "int32", "1", "crossed cells that are truly hazardous")],
-)
+@stage("path_check", version=2)
 def path_check_stage(params: NoParams, path: Bundle, risk: Bundle) -> Bundle[MetricsFacts]:
     """Planned path against the risk map of the exact elevations."""
     lattice = Lattice.from_dict(risk.meta["lattice"])
     vertices, maps = np.asarray(path["path"]), {name: np.asarray(risk[name]) for name in risk.arrays}
-    hit, figures = path_check(vertices, maps["risk"], lattice)
+    figures = path_check(vertices, maps["risk"], lattice)
     figures |= shortest(vertices, maps, lattice, Vehicle.model_validate(risk.meta["vehicle"]))
-    return Bundle({"hazard_cell": hit.astype(np.int32)}, {"metrics": figures})
+    return Bundle({}, {"metrics": figures})

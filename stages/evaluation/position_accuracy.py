@@ -12,9 +12,9 @@ where turns show it. The error is that of the camera, ``P_i - (truth_i - R_i l)`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -161,15 +161,14 @@ def position_accuracy_stage(
     trajectory: Bundle[TrajectoryFacts],
     *,
     frames: list[int],
-    truth: Mapping[str, Any],
+    truth: TruePositions,
     moments: Sequence[float | None] | None,
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against positions without rotation, of a frame and a clock of their own."""
     poses = by_frame(world_poses(trajectory), trajectory.meta["frames"], frames)
-    given = TruePositions.of(truth)
     at = None if moments is None else np.array(moments, dtype=np.float64)
     upright = trajectory.meta["verticals"][trajectory.meta["main"]] == MEASURED_VERTICAL
-    compared = position_accuracy(poses, given, at, upright)
+    compared = position_accuracy(poses, truth, at, upright)
     whole = np.full((len(frames), 3), np.nan)
     whole[:, : compared.truth.shape[1]] = compared.truth
     facts: AccuracyFacts = {"metrics": compared.metrics, "frames": frames, "warnings": compared.warnings}

@@ -137,9 +137,6 @@ MIN_FIT_PIXELS = 100
 MIN_GREY, MAX_GREY = 4.0, 250.0
 """Grey levels between which pixels are used for the ratio."""
 
-MIN_LOG_SCATTER = 0.05
-"""Least scatter of the logarithms of matched grey values."""
-
 MIN_LOG_RATIO = 0.1
 """Logarithm of the ratio that must be reached somewhere in the image for it to be corrected."""
 
@@ -193,7 +190,7 @@ def ratio_of_matches(left: Image, right: Image, state: State) -> Floats | None:
     y, x = thinned(state.left_ok, 4000)
     p, q = x + state.left.u[y, x].astype(np.int64), y + state.left.v[y, x].astype(np.int64)
     a, b = left.layers[state.level].grey[y, x], right.layers[state.level].grey[q, p]
-    # At MIN_GREY one grey level is a quarter of the value, five times MIN_LOG_SCATTER; at the top values are clipped.
+    # At MIN_GREY one grey level is a quarter of the value, five times the least scatter; at the top values are clipped.
     good = (np.minimum(a, b) > MIN_GREY) & (np.maximum(a, b) < MAX_GREY)
     if np.count_nonzero(good) < MIN_FIT_PIXELS:
         return None
@@ -207,7 +204,8 @@ def _fit(basis: Floats, target: Floats) -> Floats:
 
     def weigh(off: AnyArray) -> AnyArray:
         # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        return cauchy(off, max(MIN_LOG_SCATTER, 1.5 * epipolar.typical(off)))
+        # 0.05: least scatter of the logarithms of matched grey values.
+        return cauchy(off, max(0.05, 1.5 * epipolar.typical(off)))
 
     # Terms that the matches leave open stay near zero instead of growing outside of them.
     hold = 1e-3 * target.size * np.eye(len(basis))

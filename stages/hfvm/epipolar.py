@@ -37,8 +37,6 @@ SHARP_SPREAD_PX = 0.2
 """Pixels: median distance of sub-pixel matches from their lines in an ideal rig; beyond it the band is softened."""
 
 
-MIN_MATCHES = 40
-
 MIN_NORMAL = np.float32(1e-12)
 """Length below which a normal is none: there is no band."""
 
@@ -58,7 +56,7 @@ def fit_points(
     F : (3, 3) float64 with ``(x + u, y + v, 1) F (x, y, 1)^T = 0`` in pixels of this level.
     spread : median distance of the matches from their lines, pixels.
     """
-    if len(y) < MIN_MATCHES:
+    if len(y) < 40:
         return None
     scale = 0.5 * max(left_shape)
     left_mid = (0.5 * (left_shape[1] - 1), 0.5 * (left_shape[0] - 1))

@@ -46,9 +46,6 @@ from rille.stages.numeric.windows import window_count, window_room
 FAILED_PX = np.float32(1e9)
 """Back-matching error where there is nothing to match back from."""
 
-CHANCE_SIZE_FACTOR = 16
-"""Times the size of an isolated patch: none of chance is as large (measured on blurred noise: up to 8 times)."""
-
 CROWD_SIDE_PX = 9
 """Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
 
@@ -111,8 +108,9 @@ def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """
     if size <= 1:
         return np.zeros(keep.shape, dtype=bool)
-    # In a small image patches of CHANCE_SIZE_FACTOR times the size may not fit: an eighth of it is enough.
-    suspect = _in_small_patches(u, keep, max(size, min(CHANCE_SIZE_FACTOR * size, keep.size // 8)))
+    # 16 times the size: no patch of chance is as large (measured on blurred noise: up to 8 times). In a small image
+    # they may not fit: an eighth of it is enough.
+    suspect = _in_small_patches(u, keep, max(size, min(16 * size, keep.size // 8)))
     # The smaller patches are among these, and most matches are not.
     small = _in_small_patches(u, suspect, size)
     all_of_them = np.count_nonzero(keep)
@@ -358,9 +356,6 @@ patches of 40 pixels."""
 TARGET_MARGIN_PX = 40
 """Pixels around the places in the right image that the predictions of a tile lead to: search, rounds, features."""
 
-FILL_MARGIN_PX = 16
-"""Pixels around a window that its filling and standard deviations depend on, besides the reach along lines."""
-
 
 def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     """Arrays of :class:`~rille.stages.hfvm.finest.Fine` of a window of the left image; displacements to the whole
@@ -431,7 +426,8 @@ def around(pair: Coarse, window: Window) -> Window:
     """Window that :func:`interpolate_undefined` needs the arrays of."""
     reach = pair.images.params.fill_reach
     down, aside = (reach, 0) if pair.state.upright else (0, reach)
-    return window.grow(FILL_MARGIN_PX + down, FILL_MARGIN_PX + aside, pair.images.left.shapes[0])
+    # 16: pixels around a window that its filling and standard deviations depend on, besides the reach along lines.
+    return window.grow(16 + down, 16 + aside, pair.images.left.shapes[0])
 
 
 def interpolate_undefined(

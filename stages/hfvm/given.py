@@ -112,18 +112,11 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
 MIN_MATCHES = 100
 """Matches that a judgement needs at least."""
 
-MAX_FIT_MATCHES = 2000
-"""Matches that the lines are fitted to."""
-
 PATCH_RADIUS_PX = 8
 """Pixels: half side of a patch."""
 
 SEARCH_REACH_PX = 64
 """Pixels: how far from its match a likeness is sought."""
-
-MIN_APART_PX = 8
-"""Pixels: how far from its match a likeness counts."""
-
 
 MIN_RIGID_SHARE = 0.75
 """Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
@@ -152,7 +145,8 @@ def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.b
 
 def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Places | None:
     """Evenly spread matches: left and right pixels (n, 2), column and row; None where there are too few."""
-    y, x = thinned(matched, MAX_FIT_MATCHES)
+    # 2000: matches that the lines are fitted to.
+    y, x = thinned(matched, 2000)
     if len(y) < MIN_MATCHES:
         return None
     left = np.stack([x, y], 1).astype(np.float64)
@@ -202,7 +196,8 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         # Without lines the row through the match stands in.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
         here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
-        elsewhere = score[here & (np.hypot(j - q, i - p) >= MIN_APART_PX)]
+        # 8 pixels: how far from its match a likeness counts.
+        elsewhere = score[here & (np.hypot(j - q, i - p) >= 8)]
         # 0.05: by how much less than the match a likeness may correlate.
         looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0

@@ -176,7 +176,8 @@ def search(look: Look, field: Field) -> Field:
     """Best displacements around the predictions; at the top around none (4.3.1, Eq. 2 and 3)."""
     p = look.params
     if look.up is not None:
-        solver.search(look.pair, look.up, (p.search_columns, p.search_rows), field)
+        # A row above and below: rows are nearly right from the level above on.
+        solver.search(look.pair, look.up, (p.search_columns, 1), field)
         return field
     rows, cols = np.maximum(look.a.words.shape, look.b.words.shape)
     exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)

@@ -87,7 +87,7 @@ def _one_way(a: AnyArray, b: AnyArray, above: Map | None, params: HfvmParams) ->
     if above is not None:
         # Doubled values, each for its 2 x 2 pixels. Means of two depths at an edge would be depths that nothing has.
         doubled = ((2 * up).repeat(2, axis=0)[: a.shape[0]].repeat(2, axis=1)[:, : a.shape[1]] for up in above)
-        centre, reach = Map(*map(np.ascontiguousarray, doubled)), (params.search_columns, params.search_rows)
+        centre, reach = Map(*map(np.ascontiguousarray, doubled)), (params.search_columns, 1)
     found: IntegerMatches = search(a, b, centre, reach)
     return found
 

@@ -73,13 +73,6 @@ class HfvmParams(Params):
         description="columns [pixels] searched to either side of each predicted displacement; larger: repairs worse "
         "predictions, takes longer",
     )
-    search_rows: int = Field(
-        default=1,
-        ge=0,
-        le=8,
-        description="rows [pixels] searched above and below each predicted displacement; larger: takes longer; 0 "
-        "only for rectified images",
-    )
     band: float = Field(
         default=6.0,
         ge=0,

@@ -43,8 +43,6 @@ class Sample(NamedTuple):
     v: AnyArray
 
 
-MIN_MATCHES = 60
-
 KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
@@ -172,7 +170,7 @@ def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, 
     (3, 3) float64 H with ``(x + u, y + v, 1) ~ H (x, y, 1)``, and the share.
     """
     x, y, u, v = sample
-    if len(y) < MIN_MATCHES:
+    if len(y) < 60:
         return None
     # In half image sides all eight terms are of like size, so that one weak hold suits them all.
     scale = 0.5 * max(shape)
@@ -270,9 +268,6 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
 MAX_SIDE_PX = 1024
 """Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
 
-MIN_CONTRAST = 0.02
-"""Least contrast of a keypoint; half of OpenCV's default, for sand and haze."""
-
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
 
@@ -304,7 +299,8 @@ def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
     # Comparing all keypoints with all takes their number squared.
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=MIN_CONTRAST)  # type: ignore[attr-defined]  # not in the stubs
+    # 0.02: least contrast of a keypoint; half of OpenCV's default, for sand and haze.
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]  # not in the stubs
     points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
     if not points:
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)

@@ -74,10 +74,6 @@ ASSUMED_NOISE_VARIANCE = 8.0
 MAX_CORRECTION_PX = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
-NOISE_TEXTURE_RATIO = 0.4
-"""Local deviation for each grey level of noise that was removed from the left image, up to which it may be noise alone,
-of which denoising leaves about .3."""
-
 
 class Refined(NamedTuple):
     """Displacements (row, col) float32, the mean-free residual variance of their windows, squared grey levels (inf:
@@ -297,7 +293,9 @@ def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tup
 def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-def]
     one, two, least, nil = np.float32(1.0), np.float32(2.0), np.float32(1e-6), np.float32(0.0)
     own, both = noise
-    texture = np.float32(NOISE_TEXTURE_RATIO * NOISE_TEXTURE_RATIO)
+    # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
+    # noise alone, of which denoising leaves about .3.
+    texture = np.float32(0.4 * 0.4)
     for y in range(correlation.shape[0]):
         differ, power, count = sums[0][y], sums[1][y], sums[2][y]
         for x in range(correlation.shape[1]):
@@ -308,16 +306,6 @@ def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-d
             correlation[y, x] = max(with_noise, without) if power[x] > 0 else one
             around[y, x] = differ[x] / max(count[x], one)
 
-
-MEAN_SIDE_PX = 9
-"""Pixels: window of the local mean; brightness varies more slowly."""
-
-
-BENT_SIDE_PX = 65
-"""Pixels: side of a neighbourhood whose matches lie off their lines to one side where lenses bend the lines."""
-
-
-MAX_FIT_MATCHES = 4000
 
 BEND_STIFFNESS = 2000.0
 """Cost, squared grey levels, of a bend of one pixel; larger: smoother, small relief lost."""
@@ -371,7 +359,8 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
     # The first mean has equal weights; the next ones give pixels across an edge little weight. One round is too few.
     for _ in range(3):
         # Windows with less than a tenth of a pixel's weight have no pixel that takes part.
-        mean = window_sum(weight * rest, MEAN_SIDE_PX) / np.maximum(window_sum(weight, MEAN_SIDE_PX), 0.1)
+        # 9 pixels: window of the local mean; brightness varies more slowly.
+        mean = window_sum(weight * rest, 9) / np.maximum(window_sum(weight, 9), 0.1)
         # 10.0 grey levels: residual that halves a pixel's weight, well above camera noise.
         weight = known / (np.float32(1.0) + ((rest - mean) * np.float32(1.0 / 10.0)) ** 2)
     planes[0] = weight
@@ -382,7 +371,7 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
     """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined, or
     bent."""
-    y, x = thinned(keep, MAX_FIT_MATCHES)
+    y, x = thinned(keep, 4000)
     fit = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
     if fit is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
@@ -390,7 +379,8 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
     # Clipped, lest a patch of wrong matches passes for a bend.
     off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
     off = np.where(keep, off, np.float32(0))
-    bent = (window_sum32(off, BENT_SIDE_PX) / np.maximum(window_count(keep, BENT_SIDE_PX), 1))[y, x]
+    # 65 pixels: side of a neighbourhood whose matches lie off their lines to one side where lenses bend the lines.
+    bent = (window_sum32(off, 65) / np.maximum(window_count(keep, 65), 1))[y, x]
     # 0.05 pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square.
     trust = min(1.0, (0.05 / max(fit[1], 1e-9)) ** 2)
     # 0.1 pixels: median of those means up to which the lines are trusted; noise has .02.
@@ -487,9 +477,6 @@ def _sweep(normal, across, down, u, v):  # type: ignore[no-untyped-def]
                 vo[x + 2] += overshoot * (minor_u[x] * sv - cross[x] * su - vo[x + 2])
 
 
-SURROUNDINGS_SIDE_PX = 9
-"""Pixels: side of the window in which unmatched pixels count; about the reach of features and windows together."""
-
 BLANK_STD_PX = 0.2
 """Standard deviation (pixels) that is added to matches of textureless regions; the parts below do not explain it."""
 
@@ -536,6 +523,7 @@ def neighbours(disparity: AnyArray, keep: NDArray[np.bool_]) -> Maps:
     use = cv2.erode(keep.view(np.uint8), five, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     bend *= use
     relief, count = window_sum32(bend * bend, side), np.maximum(window_count(use.view(bool), side), 1)
-    missing, room = window_count(~keep, SURROUNDINGS_SIDE_PX), window_room(keep.shape, SURROUNDINGS_SIDE_PX)
+    # 9 pixels: side of the window in which unmatched pixels count; about the reach of features and windows together.
+    missing, room = window_count(~keep, 9), window_room(keep.shape, 9)
     share = np.divide(missing, room, dtype=np.float32, casting="same_kind")
     return np.divide(relief, count, dtype=np.float32, casting="same_kind"), share

@@ -16,7 +16,7 @@ A window has a vote if most displacements leave it inside the right image, and i
 windows that any displacement leads to the same right pixel, one with the same displacement is the most alike. What the
 right image hides, such as the strip beside a near thing, has no match, and takes what belongs to another. Windows to
 which two displacements are equal (a black or an overexposed sky) have no vote either. A window whose best displacement
-is one of the last two on either side does not agree. Nearly half of a region (:data:`MIN_VOTING_SHARE`) must have a
+is one of the last two on either side does not agree. Nearly half of a region must have a
 vote: what lies between a near thing and the image's border may be hidden in the right image.
 
 Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
@@ -215,10 +215,6 @@ MAX_AGREE_DISTANCE_PX = 2.5
 MAX_SLOPE = MAX_VOTE_DISTANCE_PX / WINDOW_RADIUS_PX
 """Displacements a pixel: across the windows of a steeper plane no displacement is right."""
 
-MIN_VOTING_SHARE = 0.45
-"""Share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations but noise; a
-wall of Monopoly that is largely hidden at most .39, and where blocks of a JPEG image of Lampshade1 agree .44."""
-
 
 class Planes(NamedTuple):
     """Planes of textureless regions.
@@ -275,7 +271,10 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
         # Half of the displacements leave a window with a vote inside the right image.
         usable = (found.tried >= 0.5 * len(steps)) & (found.distinct > 0)
         y, x = np.nonzero(usable & found.mutual)
-        if len(y) < max(MIN_REGION_PX, MIN_VOTING_SHARE * np.count_nonzero(inside)):
+        # 0.45: share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations
+        # but noise; a wall of Monopoly that is largely hidden at most .39, and where blocks of a JPEG image of
+        # Lampshade1 agree .44.
+        if len(y) < max(MIN_REGION_PX, 0.45 * np.count_nonzero(inside)):
             continue
         votes, step = found.distinct[y, x].astype(np.float64), found.best[y, x].astype(np.float64)
         g, error = _fit(x + x0, y + y0, step, votes)

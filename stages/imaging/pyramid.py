@@ -3,7 +3,7 @@
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
 are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are
 (:data:`MIN_VALID`); its value is the mean of the valid ones. A black frame, as warping an image leaves, is no part of
-it (:func:`frame`); there two of four are enough (:data:`MIN_VALID_AT_FRAME`).
+it (:func:`frame`); there two of four are enough.
 """
 
 from __future__ import annotations
@@ -38,9 +38,6 @@ class PyramidParams(Params):
 MIN_VALID = 3
 """Valid pixels of four that make a coarse pixel valid. A frame one pixel wide doubles its width so, in pixels of the
 image, from level to level."""
-
-MIN_VALID_AT_FRAME = 2
-"""The same where the image has a black frame: pixels that are half outside of a warped image draw matches astray."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +159,8 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
         mask &= ~black
     if not (image.dtype.kind == "u" and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    least = MIN_VALID if black is None else MIN_VALID_AT_FRAME
+    # 2: where the image has a black frame: pixels that are half outside of a warped image draw matches astray.
+    least = MIN_VALID if black is None else 2
     pyramid = halved(level, mask.view(np.uint8), levels_of(level.shape, params), least)
     return Pyramid(pyramid.images, pyramid.valid, noise.standard_deviation(pyramid.images, pyramid.valid))
 

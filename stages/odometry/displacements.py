@@ -19,8 +19,6 @@ from rille.stages.numeric.robust import cauchy
 
 NEIGHBOURS = 12
 """Number of tracks that an affinity is fitted to: four times the three that it needs, and still local."""
-PULL = 5.0
-"""Spread [pixels] of the neighbours below which they do not determine a change of shape."""
 
 
 def known(points: Floats) -> Bools:
@@ -81,7 +79,8 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
         return np.asarray(weight * count / weight.sum(-1, keepdims=True))
 
     design = np.concatenate([offset, np.ones((n, count, 1))], -1)
-    fitted = irls(design, shift, weights, count * np.diag([PULL**2, PULL**2, 0.0]), rounds=4)
+    # 5.0: spread [pixels] of the neighbours below which they do not determine a change of shape.
+    fitted = irls(design, shift, weights, count * np.diag([5.0**2, 5.0**2, 0.0]), rounds=4)
     return common + np.swapaxes(fitted[:, :2], 1, 2), fitted[:, 2]
 
 

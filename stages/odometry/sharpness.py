@@ -16,9 +16,6 @@ from rille.stages.odometry.displacements import windows_at
 NOTABLE = 0.6
 """Share of squared gradients from which on images count as equally sharp: a blur of half a pixel leaves .7."""
 
-STEP = 1.2
-"""Ratio of the blurs that are tried: four fifths of the right one serve the alignment as well."""
-
 
 def equally_sharp(a: Floats32, b: Floats32, in_a: Floats, in_b: Floats) -> tuple[Floats32, Floats32] | None:
     """Images (rows, cols), the sharper one blurred until it is about as sharp as the other; None if they are alike.
@@ -43,7 +40,8 @@ def _blurred(image: Floats32, points: Floats, wanted: float) -> Floats32:
         wider = cv2.GaussianBlur(image, (0, 0), sigma)
         if _gradients(wider, points) < wanted:
             break
-        blurred, sigma = wider, sigma * STEP
+        # 1.2: ratio of the blurs that are tried: four fifths of the right one serve the alignment as well.
+        blurred, sigma = wider, sigma * 1.2
     return blurred
 
 

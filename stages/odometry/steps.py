@@ -26,9 +26,6 @@ from rille.stages.core.validity import matched, matched_share
 from rille.stages.facts.odometry import MotionFacts, StepTableFacts
 from rille.stages.odometry.displacements import fit_affinity, known_median
 
-BLOCKS = 200
-"""Approximate number of blocks of an image; more change the overlap by less than 1 %, at a cost that grows with their
-square."""
 MIN_MATCHES = 0.2
 """Share of the textured pixels that must find a displacement for two frames to count as overlapping."""
 
@@ -51,7 +48,9 @@ class Step:
         validity = np.asarray(bundle["validity"])
         known = matched(validity)
         # By the area, so that images of all shapes have about as many blocks.
-        side = max(1, round((known.size / BLOCKS) ** 0.5))
+        # 200: approximate number of blocks of an image; more change the overlap by less than 1 %, at a cost that grows
+        # with their square.
+        side = max(1, round((known.size / 200) ** 0.5))
         inside = _blocks(known, side)
         # Fewer may agree by chance.
         enough = inside.mean(-1) >= 0.5

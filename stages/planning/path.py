@@ -180,9 +180,6 @@ __all__ = ["PathParams", "Route", "describe", "find_path", "path_stage"]
 Ends = tuple[Point | None, Point | None]
 Cells = tuple[Cell | None, Cell | None]
 
-START_COST = 1e3
-"""Cost of a metre [m of climb] by which a path by rows begins beside its place, more than that of any ground."""
-
 BY_ROWS = "hazardous or unknown ground closes the whole width"
 AHEAD = "no ground that is known and safe leads a vehicle's length ahead"
 JOINED = "start and target are not connected by ground that the vehicle may cross"
@@ -317,11 +314,12 @@ def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point:
 
 
 def first_costs(starts: Bools, row: int, cell: float) -> Ints:
-    """Cost (row, col) of starting at a cell, :data:`UNREACHED` where that is not permitted: by :data:`START_COST` for
+    """Cost (row, col) of starting at a cell, :data:`UNREACHED` where that is not permitted: by a cost for
     each metre along rows and columns from the middle of a row."""
     rows, cols = (np.arange(n) for n in starts.shape)
     moves = np.abs(rows - row)[:, None] + np.abs(cols - len(cols) // 2)
-    return np.where(starts, moves * round(START_COST * cell / COST_UNIT_M), UNREACHED)
+    # 1e3: cost of a metre [m of climb] by which a path by rows begins beside its place, more than that of any ground.
+    return np.where(starts, moves * round(1e3 * cell / COST_UNIT_M), UNREACHED)
 
 
 def row_span(cells: Bools) -> tuple[int, int]:

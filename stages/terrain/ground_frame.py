@@ -50,7 +50,6 @@ from rille.stages.terrain.matches import Matches
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
 
-MAX_TILT_DEG = 30.0  # largest slope of the ground, and largest roll of an unknown attitude
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
@@ -292,7 +291,8 @@ def _given_vertical(hint: VerticalHint) -> tuple[Floats | None, str]:
 
 def _allowed(normals: Floats, vertical: Floats | None) -> Bools:
     """Which normals may be the ground's: near the known vertical, else within the limits of roll and pitch."""
-    tilt = math.radians(MAX_TILT_DEG)
+    # 30.0 degrees: largest slope of the ground, and largest roll of an unknown attitude.
+    tilt = math.radians(30.0)
     if vertical is not None:
         return np.asarray(normals @ vertical >= math.cos(tilt))
     pitch = np.degrees(np.arctan2(-normals[:, 2], -normals[:, 1]))

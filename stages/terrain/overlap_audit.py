@@ -13,9 +13,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from rille.stages.core.declare import Bundle, Params, stage
+from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import told
 from rille.stages.core.quantities import metres
 from rille.stages.facts.terrain import AuditFacts, OverlapFacts
@@ -23,20 +22,13 @@ from rille.stages.facts.terrain import AuditFacts, OverlapFacts
 Facts = Mapping[str, Any]
 
 
-class OverlapAuditParams(Params):
-    """Parameters of the stage ``overlap_audit``."""
-
-    allowed_sigmas: float = Field(
-        2.0, gt=0, description="standard deviations of a cell's difference that bias and tilt of a seam may amount to"
-    )
-
-
-def stands_out(seam: Facts, allowed_sigmas: float) -> bool:
+def stands_out(seam: Facts) -> bool:
     """Whether bias and tilt of a seam are beyond the sigma of a cell, and beyond its noise."""
-    return bool(seam["systematic"] > allowed_sigmas * max(seam["expected"], seam["noise"]))
+    # Bias and tilt amount to more than two standard deviations of a cell's difference.
+    return bool(seam["systematic"] > 2.0 * max(seam["expected"], seam["noise"]))
 
 
-def audit(seams: Sequence[Facts], allowed_sigmas: float) -> list[dict[str, Any]]:
+def audit(seams: Sequence[Facts]) -> list[dict[str, Any]]:
     """Each model against its neighbours, the worst first.
 
     Parameters
@@ -67,7 +59,7 @@ def audit(seams: Sequence[Facts], allowed_sigmas: float) -> list[dict[str, Any]]
                 "systematic": float(np.median([s["systematic"] for s in mine])),
                 "expected": float(np.median([s["expected"] for s in mine])),
                 "neighbours": others,
-                "contradicts": 2 * sum(stands_out(s, allowed_sigmas) for s in mine) > len(mine),
+                "contradicts": 2 * sum(stands_out(s) for s in mine) > len(mine),
                 "either": len(others) == 1 and len(of[others[0]]) == 1,
             }
         )
@@ -88,10 +80,10 @@ def describe(model: Facts) -> str:
 
 
 @stage("overlap_audit", version=3)
-def overlap_audit_stage(params: OverlapAuditParams, seams: Sequence[Bundle[OverlapFacts]]) -> Bundle[AuditFacts]:
+def overlap_audit_stage(params: NoParams, seams: Sequence[Bundle[OverlapFacts]]) -> Bundle[AuditFacts]:
     """Which elevation models contradict their neighbours, in bias and tilt, the worst first."""
     every = [s for bundle in seams for s in bundle.meta["seams"]]
-    models = audit(every, params.allowed_sigmas)
+    models = audit(every)
     bad = [m for m in models if m["contradicts"]]
     ranked = sorted(every, key=lambda s: (-s["systematic"] / max(s["expected"], 1e-12), s["pair"], s["other"]))
     kept = ("pair", "other", "cells", "bias", "tilt", "noise", "systematic", "expected")

@@ -601,7 +601,7 @@ def test_a_baseline_of_two_stations_far_apart_is_read_where_its_unit_is_stated(t
             ("RIL-223", "rig.T_right_left"),
         ),
         ({"rig": "[rig]\nT_right_left = [[2,0,0,-1],[0,1,0,0],[0,0,1,0]]\n"}, ("RIL-223", "rig.T_right_left")),
-        ({"rig": "[rig]\nbaselin = 0.1\n"}, ("RIL-223", "'rig.baselin'", "0.1", "'rig.baseline'")),
+        ({"rig": "[rig]\nbaselin = 0.1\n"}, ("RIL-223", "'rig.baselin'", "0.1", "mean rig.baseline?")),
         ({"rig": ""}, ("RIL-241",)),
         ({"cameras": ""}, ("RIL-235",)),
         (
@@ -624,7 +624,7 @@ def test_a_baseline_of_two_stations_far_apart_is_read_where_its_unit_is_stated(t
             ("RIL-131", "640 x 480", "64 x 48"),
         ),
         ({"cameras": '[cameras]\nfile = "nothing.yaml"\n'}, ("RIL-138", "nothing.yaml")),
-        ({"head": "baseline = 0.1"}, ("RIL-223", "'baseline'", "0.1", "'rig.baseline'")),
+        ({"head": "baseline = 0.1"}, ("RIL-223", "'baseline'", "0.1", "mean rig.baseline?")),
         ({"head": "colour = 1"}, ("RIL-223", "'colour'")),
         ({"head": "name = "}, ("RIL-026", "rover.rille.toml")),
         ({"text": "[images.more]\n"}, ("RIL-223", "'images.more'")),
@@ -636,7 +636,7 @@ def test_a_baseline_of_two_stations_far_apart_is_read_where_its_unit_is_stated(t
         ({"text": '[world]\ncrs = "EPSG:32633"\n'}, ("RIL-223", "azimuth_deg")),
         ({"text": "[world]\nup = [0, 0, 0]\n"}, ("RIL-223", "world.up", "0")),
         ({"text": "[vehicle]\nmax_step = 0.5\n"}, ("RIL-223", "max_step", "0.5", "0.2")),
-        ({"text": "[vehicle]\nmax_steps = 0.5\n"}, ("RIL-223", "'vehicle.max_steps'", "'vehicle.max_step'")),
+        ({"text": "[vehicle]\nmax_steps = 0.5\n"}, ("RIL-223", "'vehicle.max_steps'", "mean vehicle.max_step?")),
     ],
 )
 def test_bad_manifests(tmp_path, parts, expected):

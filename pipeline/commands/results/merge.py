@@ -35,9 +35,6 @@ from rille.stages.terrain.merge import merge as merge_layers
 from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.shading import gradient
 
-MAX_CELL_RATIO = 1.5
-"""Ratio of two runs' cell sizes: coarser cells would be interpolated between, finer ones left out."""
-
 
 @dataclass(frozen=True)
 class Session:
@@ -117,7 +114,8 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         Their cells are too unlike, or they have no ground in common.
     """
     ratio = other.lattice.cell / first.lattice.cell
-    if not 1.0 / MAX_CELL_RATIO < ratio < MAX_CELL_RATIO:
+    # 1.5: ratio of two runs' cell sizes: coarser cells would be interpolated between, finer ones left out.
+    if not 1.0 / 1.5 < ratio < 1.5:
         text = f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m"
         raise InputError("RIL-851", text, remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}")
     placed = _placed(first, other)

@@ -24,18 +24,11 @@ from rille.stages.geometry.rigid import fit_rigid
 MIN_FRAMES = 4
 """Fewest frames with pose and truth: more than the unknowns (turn, shift, clock offset) take up."""
 
-MAX_OFFSET_S = 10.0
-"""Largest clock offset that is searched where the clocks have a time in common: a longer search finds other stretches
-of the track that look alike."""
-
 MIN_SHARE = 2 / 3
 """Smallest number of compared frames, as a share of the most that any offset compares: few frames fit anywhere."""
 
 EQUAL_ERROR = 2**0.5
 """Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
-
-MAX_RANGE_SHARE = 0.5
-"""Share of the searched range: where equally good offsets span more, the offset is not determined."""
 
 MAX_TRIALS = 20000
 """Most offsets that are tried before the best one is refined."""
@@ -55,7 +48,7 @@ class TruePositions:
     lever_arm: Floats | None = None
 
     @staticmethod
-    def of(d: Mapping[str, Any]) -> TruePositions:
+    def from_dict(d: Mapping[str, Any]) -> TruePositions:
         """From the JSON form of :class:`rille.datasets.protocol.Positions`."""
         values: Mapping[str, Any] = {name: np.array(v) if isinstance(v, list | tuple) else v for name, v in d.items()}
         return TruePositions(**values)
@@ -123,7 +116,8 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
     ends = [worse[above - 1] if above > 0 else 0, worse[above] if above < len(worse) else -1]
     ended = [bool(EQUAL_ERROR * error(value) < errors[k] < np.inf) for k in ends]
     low, high = (float(tried[k]) for k in ends)
-    determined = all(ended) and high - low < MAX_RANGE_SHARE * np.ptp(tried[np.isfinite(errors)])
+    # 0.5: share of the searched range: where equally good offsets span more, the offset is not determined.
+    determined = all(ended) and high - low < 0.5 * np.ptp(tried[np.isfinite(errors)])
     return Offset(0.0 if not determined and low <= 0.0 <= high else value, low, high, bool(determined))
 
 
@@ -133,7 +127,9 @@ def _candidates(moments: Floats, truth: TruePositions) -> Floats:
     low, high = float(moments[0] - truth.times[-1]), float(moments[-1] - truth.times[0])
     step = 0.5 * float(np.median(np.diff(moments))) if len(moments) > 1 else 0.1
     if low < 0.0 < high:
-        low, high = max(low, -MAX_OFFSET_S), min(high, MAX_OFFSET_S)
+        # 10.0: largest clock offset that is searched where the clocks have a time in common: a longer search finds
+        # other stretches of the track that look alike.
+        low, high = max(low, -10.0), min(high, 10.0)
         # Of images a minute apart half a frame is more than all that is searched.
         step = min(max(step, (high - low) / MAX_TRIALS), 0.5 * (high - low))
         return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))

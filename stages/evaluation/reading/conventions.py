@@ -22,7 +22,6 @@ from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms,
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
-MIN_SHARE = 1e-6
 # Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
 # reading leaves at most, and of the extent; and from where on no estimate errs so.
 MIN_MISFIT, MAX_SHARE, MAX_MISFIT, MUCH = 0.02, 0.4, 0.1, 0.3
@@ -75,7 +74,7 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     # An extent of a few standard deviations is that of a camera at rest.
     if len(P) < MIN_FRAMES or spread(P) < max(5.0 * sigma, 1e-6):
         return []
-    if spread(Q) < MIN_SHARE * spread(P):
+    if spread(Q) < 1e-6 * spread(P):
         return [f"the truth rests, the trajectory extends {spread(P):.3g} m: is it the right file, and does it go on?"]
     moved, said = (np.linalg.norm(np.diff(T[:, :, 3], axis=0), axis=1) for T in (estimate, truth))
     # 20 times the longest step of the estimate is a jump.

@@ -23,10 +23,6 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_log
 from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
 
-MAX_ERROR_SHARE = 0.5
-"""Share of the error of the motions from frame to frame that is left at most: errors of an estimate do not go with a
-constant transform of the truth."""
-
 MIN_TURN = math.radians(0.5)
 """Least turn where no shift shows: of a camera that hardly turns, a smaller one is as likely its principal point's."""
 
@@ -62,7 +58,9 @@ def hand_eye(estimate: Floats, truth: Floats) -> Floats | None:
         rigid.rms(rigid.relative_error(*rigid.steps(estimate, true))[:, :, 3])
         for true in (truth, rigid.compose(truth, found))
     )
-    return found if left < MAX_ERROR_SHARE * as_given else None
+    # 0.5: share of the error of the motions from frame to frame that is left at most: errors of an estimate do not go
+    # with a constant transform of the truth.
+    return found if left < 0.5 * as_given else None
 
 
 def _turn(p: Floats, q: Floats, arm: Floats, lever: float) -> Floats:

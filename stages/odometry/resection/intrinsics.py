@@ -64,8 +64,9 @@ STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
 
 
-MIN_SEGMENTS = 3
-"""Segments that turn, below which the prior decides."""
+MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
+"""Segments that turn, below which the prior of the cameras' numbers decides; and segments that have to agree on a yaw
+before it is corrected, which each says far better."""
 
 MIN_ERROR = 0.0175
 """Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
@@ -76,13 +77,6 @@ MIN_CHANGE = 0.004
 MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
-
-MIN_YAW_SEGMENTS = 2
-"""Segments that have to agree on a yaw before it is corrected; each says it far better than a turn says the numbers of
-a camera."""
-
-MIN_SIGMAS = 5.0
-"""Standard deviations of the estimate from which on a prior is not believed."""
 
 
 class IntrinsicsParams(Params):
@@ -258,7 +252,8 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
             if matrix[i, i] > 0:
                 value, variance = np.linalg.solve(free, right)[i], np.linalg.inv(free)[i, i]
                 departure[i] = abs(value) / math.sqrt(variance) if abs(value) > least else 0.0
-        if departure.max() <= MIN_SIGMAS:
+        # 5.0: standard deviations of the estimate from which on a prior is not believed.
+        if departure.max() <= 5.0:
             return CommonErrors(errors, np.linalg.inv(matrix + prior), wrong)
         wrong[departure.argmax()] = True
 

@@ -29,8 +29,6 @@ from rille.stages.odometry.resection.trajectory import propagation
 
 MIN_BLOCKS, BLOCKS = 5, 4
 """Parts of either image, of 4 x 4, in which landmarks agree."""
-MAX_DEPTH_RATIO = 1.1
-"""Median ratio of a point's depths by both pairs, either way."""
 HERE = RigidTransform.identity()
 
 
@@ -72,7 +70,8 @@ def loop_between(a: Features, b: Features, matches: NDArray[np.uint32], seed: in
             raise NoLoopError(f"what agrees lies in {covered} of {BLOCKS**2} parts of the image")
     here, other = (one.landmarks.position[rows] for one, rows in zip((a, b), to_b[there.inlier].T, strict=True))
     ratio = float(np.nanmedian(T_b_a.apply(here)[:, 2] / other[:, 2]))
-    if not 1.0 / MAX_DEPTH_RATIO < ratio < MAX_DEPTH_RATIO:
+    # 1.1: median ratio of a point's depths by both pairs, either way.
+    if not 1.0 / 1.1 < ratio < 1.1:
         raise NoLoopError(f"points are {ratio:.2f} times as far by one pair as by the other")
     # The way there and back: with the errors of both it does not end where it began.
     around = T_a_b @ T_b_a

@@ -32,8 +32,6 @@ from rille.stages.odometry.resection.sensors import (
 
 MIN_LEAN = math.radians(0.05)
 """Of the world against the vertical that is not worth a word: 1 mm a metre."""
-MAX_SHARED_SIGMAS = 4.0
-"""Standard deviations of what all measurements of a sensor share, from which on it is wrong."""
 REMEDY = {
     "odometry": "correct T_body_left, unit or time_offset, or raise drift and turn_deg",
     "attitude": "correct T_body_left (T_imu_left), the order of its columns or time_offset, or raise sigma_deg",
@@ -177,7 +175,8 @@ class Sensors:
             why = ""
             if np.mean(kept) < MAJORITY:
                 why = f"{(~kept).sum()} of its {len(kept)} measurements contradict the others"
-            elif worst >= 0 and abs(shared[worst]) > MAX_SHARED_SIGMAS:
+            # 4.0: standard deviations of what all measurements of a sensor share, from which on it is wrong.
+            elif worst >= 0 and abs(shared[worst]) > 4.0:
                 error = self.used[name].shared_errors[worst]
                 off = abs(float(shared[worst]))
                 why = f"its {error.name} is off by {off * error.sigma:.2g}{error.unit}, {off:.0f} standard deviations"

@@ -12,16 +12,8 @@ from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera
 from rille.stages.odometry.resection.robust_pose import sampled_pose
 
-LEFT_OUT = 0.1
-"""Share of the landmarks that contradict a pose from which on the focal length is tried: moving objects and wrong
-tracks make up less, mostly."""
-EXPLAINED = 0.6
-"""Share of those that agree with another focal length from which on that is the cause: of a zoom by 2 % some 0.8, of
-another vehicle or of the own body, to which a focal length adapts as well, at most 0.35."""
 MIN_CHANGE = 0.003
 """Change of the focal length over itself that can be told from errors of the landmarks."""
-FEWEST = 20
-"""Landmarks below which nothing is said: a pose with its focal length fits any four."""
 
 
 def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int, bound: float, frame: int) -> None:
@@ -40,7 +32,10 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
         The focal length changed.
     """
     count = len(pixels)
-    if count < FEWEST or count - agreeing < LEFT_OUT * count:
+    # 0.1: share of the landmarks that contradict a pose from which on the focal length is tried: moving objects and
+    # wrong tracks make up less, mostly.
+    # 20: landmarks below which nothing is said: a pose with its focal length fits any four.
+    if count < 20 or count - agreeing < 0.1 * count:
         return
     # One focal length, as the solver wants it: that of the columns.
     square = (pixels - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
@@ -49,7 +44,9 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
     if found is None:
         return
     agree, larger = found["num_inliers"], zoomed.focal_length / camera.fx - 1.0
-    if agree - agreeing < EXPLAINED * (count - agreeing) or abs(larger) < MIN_CHANGE:
+    # 0.6: share of those that agree with another focal length from which on that is the cause: of a zoom by 2 % some
+    # 0.8, of another vehicle or of the own body, to which a focal length adapts as well, at most 0.35.
+    if agree - agreeing < 0.6 * (count - agreeing) or abs(larger) < MIN_CHANGE:
         return
     raise DegenerateError(
         "RIL-771",

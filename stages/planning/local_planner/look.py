@@ -25,8 +25,6 @@ Stand = tuple[float, float, float]
 RIM_SHARE = 0.04
 """Share of the image's width and height along its border that does not count as seen: no matching window fits there,
 and the vehicle does not stand exactly level."""
-MIN_VIEW_SHARE = 0.9
-"""Share of a set of points that must be in view for the set to count as in view."""
 TURN_STEP = math.radians(5.0)
 """Step [rad] between the turns that are tried."""
 
@@ -56,8 +54,9 @@ class FieldOfView:
         return np.asarray((self.edges @ at > 0).all(axis=0))
 
     def holds(self, points: Floats, stand: Stand) -> bool:
-        """Whether :data:`MIN_VIEW_SHARE` of these points lie in view."""
-        return bool(self.sees(points, stand).mean() >= MIN_VIEW_SHARE)
+        """Whether nearly all of these points lie in view."""
+        # 0.9: share of a set of points that must be in view for the set to count as in view.
+        return bool(self.sees(points, stand).mean() >= 0.9)
 
 
 def _edges(camera: Camera, T_vehicle_camera: RigidTransform) -> Floats:

@@ -59,9 +59,9 @@ def test_navigation_matches_fast_unless_told_otherwise(tmp_path: Path) -> None:
 
 
 def test_unknown_key_names_the_nearest() -> None:
-    with raises("RIL-027", "'keyframes.strid'", "'keyframes.stride'"):
+    with raises("RIL-027", "'keyframes.strid'", "mean keyframes.stride?"):
         config.build(config.parse_assignments(["keyframes.strid=2"]))
-    with raises("RIL-027", "'locsu'", "'locus'"):
+    with raises("RIL-027", "'locsu'", "mean locus"):
         config.build({"locsu": {"cell_size": 1.0}})
 
 

@@ -119,7 +119,7 @@ def bundles() -> dict[str, Bundle]:
     made["dem_accuracy"] = Bundle({"error": error}, {**lattice, "metrics": judged})
     positions, assessed = trajectory_accuracy(poses, poses)
     made["accuracy"] = Bundle(positions, {"metrics": assessed, "frames": list(FRAMES)})
-    _, checked = path_check(path, risk, Lattice.from_dict(LATTICE))
+    checked = path_check(path, risk, Lattice.from_dict(LATTICE))
     made["path_check"] = Bundle({}, {"metrics": checked})
     for frame in FRAMES:
         image = rng.integers(0, 255, (48, 64)).astype(np.uint8)

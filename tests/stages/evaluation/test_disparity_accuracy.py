@@ -7,7 +7,8 @@ import pytest
 
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.core.validity import Validity
-from rille.stages.evaluation.disparity_accuracy import disparity_accuracy, disparity_accuracy_stage, filled, misread
+from rille.stages.evaluation.disparity_accuracy import disparity_accuracy, disparity_accuracy_stage, filled
+from rille.stages.evaluation.reading.disparities import misread
 
 NAN = np.nan
 

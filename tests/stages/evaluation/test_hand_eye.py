@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams
-from rille.stages.evaluation.accuracy import accuracy_stage
+from rille.stages.evaluation.accuracy import TruthSource, accuracy_stage
+from rille.stages.evaluation.reading.clock import TruePositions
 from rille.stages.evaluation.reading.hand_eye import hand_eye
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
@@ -77,7 +78,7 @@ def test_figures_without_it_stand_beside_those_as_given() -> None:
     trajectory = Bundle({"poses": poses, "covariance": covariance}, {"frames": frames})
     mount = RigidTransform(Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix(), np.array([0.1, 0.0, 0.0]))
     given = rigid.compose(true, rigid.inverse(OFF)).reshape(-1, 12).tolist()
-    facts = accuracy_stage(NoParams(), trajectory, frames=frames, truth=given, mount=mount).meta
+    facts = accuracy_stage(NoParams(), trajectory, frames=frames, truth=given, source=TruthSource(mount)).meta
     value = {name: figure["value"] for name, figure in facts["metrics"].items()}
     assert value["hand_eye_turn"] == pytest.approx(4.0, abs=0.3)
     assert value["hand_eye_shift"] == pytest.approx(0.054, abs=0.01)
@@ -95,16 +96,10 @@ def judged(estimate: Floats, true: Floats, record: Floats, offset: float) -> lis
     trajectory = Bundle(
         {"poses": estimate, "covariance": np.tile(1e-5 * np.eye(6), (len(true), 1, 1))}, {"frames": frames}
     )
-    positions = {
-        "positions": record.tolist(),
-        "times": (0.05 * np.arange(len(record)) + offset).tolist(),
-        "max_gap": 0.2,
-    }
-    moments = [0.2 * frame for frame in frames]
-    given = {"frames": frames, "truth": true.reshape(-1, 12).tolist()}
-    return accuracy_stage(
-        NoParams(), trajectory, **given, record={"truth": positions, "moments": moments, "frames": frames}
-    ).meta.get("warnings", [])
+    positions = TruePositions(record, 0.05 * np.arange(len(record)) + offset, 0.2)
+    source = TruthSource(record=positions, moments=[0.2 * frame for frame in frames])
+    given = {"frames": frames, "truth": true.reshape(-1, 12).tolist(), "source": source}
+    return accuracy_stage(NoParams(), trajectory, **given).meta.get("warnings", [])
 
 
 @pytest.mark.parametrize("late", [0.0, 0.3, -0.25])

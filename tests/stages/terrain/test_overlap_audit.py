@@ -12,7 +12,7 @@ from seam_scenes import SIGMA, along
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.terrain import overlap_audit as audit_stage
 from rille.stages.terrain import overlap_qa as seam_stage
-from rille.stages.terrain.overlap_audit import OverlapAuditParams, audit, stands_out
+from rille.stages.terrain.overlap_audit import audit, stands_out
 
 PLANTED = 12
 
@@ -24,7 +24,7 @@ def audited(dems: dict[int, Bundle]) -> tuple[list[Bundle], dict]:
         seams.append(seam_stage.overlap_qa_stage.run(NoParams(), {}, inputs))
         check_outputs(seam_stage.overlap_qa_stage, seams[-1])
         json.dumps(seams[-1].meta, allow_nan=False)
-    found = audit_stage.overlap_audit_stage.run(OverlapAuditParams(), {}, {"seams": seams})
+    found = audit_stage.overlap_audit_stage.run(NoParams(), {}, {"seams": seams})
     json.dumps(found.meta, allow_nan=False)
     return seams, dict(found.meta)
 
@@ -118,13 +118,13 @@ def test_of_a_large_overlap_some_cells_tell_as_much() -> None:
 
 @pytest.mark.parametrize(("systematic", "noise", "expected"), [(2.1, 1.0, True), (1.9, 0.1, False), (2.1, 1.1, False)])
 def test_a_seam_stands_out_beyond_sigma_and_noise(systematic: float, noise: float, expected: bool) -> None:
-    assert stands_out({"systematic": systematic, "expected": 1.0, "noise": noise}, 2.0) is expected
+    assert stands_out({"systematic": systematic, "expected": 1.0, "noise": noise}) is expected
 
 
 def test_a_model_with_half_of_its_seams_wrong_does_not_contradict() -> None:
     seam = {"cells": 100, "bias": 0.0, "tilt": [0.0, 0.0], "noise": 0.0, "expected": 1.0}
     ends = (0, 4, 9.0), (4, 8, 0.0), (8, 12, 0.0)
-    models = audit([seam | {"other": a, "pair": b, "systematic": error} for a, b, error in ends], 2.0)
+    models = audit([seam | {"other": a, "pair": b, "systematic": error} for a, b, error in ends])
     assert [m["pair"] for m in models if m["contradicts"]] == [0]
 
 
