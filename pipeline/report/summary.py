@@ -146,11 +146,11 @@ def given_numbers(view: RunView) -> list[str]:
 
 def _unlike(figures: Mapping[str, Any]) -> list[str]:
     """Trajectory and crosscheck are not alike anywhere: no frame then stands out."""
-    # Per cent of the length; beyond, the trajectories have nothing in common.
-    if (_value(figures, "agreement_share") or 0.0) <= 50.0:
+    # Per cent of the length. 29 are left of a straight way where the other trajectory rests: half of that is not alike.
+    if (_value(figures, "agreement_share") or 0.0) <= 15.0:
         return []
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
-    return [f"trajectory and COLMAP have nothing in common: {rmse} RMS over {length}; one is wrong"]
+    return [f"trajectory and COLMAP are unlike throughout: {rmse} RMS over {length}; one is wrong"]
 
 
 def _value(figures: Mapping[str, Any], name: str) -> Any:

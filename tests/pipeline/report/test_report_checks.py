@@ -57,7 +57,7 @@ def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
     assert page_.text.index("0.60 px") < page_.text.index("Accuracy Quantity")
 
 
-@pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (190_000.0, 1)])
+@pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (29.0, 1), (190_000.0, 1)])
 def test_a_crosscheck_that_is_wrong_as_a_whole_is_told(share: float | None, told: int) -> None:
     values = {"rmse": 512.3, "length": 0.27, "share": share}
     lines = summary._unlike({f"agreement_{name}": {"value": value} for name, value in values.items()})
