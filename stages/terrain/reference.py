@@ -75,6 +75,10 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
             f"camera heights, where {MIN_REFERENCE_SHARE:.0%} or {MIN_REACH_HEIGHTS:g} heights, a known vertical or "
             "another pair with the same plane would show ground (terrain.reference=ground takes it for that)"
         )
+    coarse_only = [facts for facts in levels if facts["plane"] and "no_ground" in facts]
+    if coarse_only and not planes:
+        share = coarse_only[0]["ground_share"]
+        why += f"; a plane that may be ground holds {share:.0%} of the matched pixels: {coarse_only[0]['no_ground']}"
     return GroundVerdict(len(shown) > len(others), why)
 
 

@@ -48,6 +48,7 @@ def test_ground_is_what_pairs_show_with_evidence(levels: list[Any], shown: bool)
 def test_ground_too_far_for_the_rig_counts_where_a_cell_size_is_stated() -> None:
     far = ground(MIN_REFERENCE_SHARE, no_ground="too coarse")
     assert [judge([far], coarse=coarse).ground for coarse in (False, True)] == [False, True]
+    assert "40% of the matched pixels: too coarse" in judge([far, WALL], coarse=False).why
 
 
 def test_the_reason_holds_the_figures() -> None:
