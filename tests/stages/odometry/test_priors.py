@@ -220,6 +220,19 @@ def test_positions_say_where_the_world_lies():
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
 
 
+def test_positions_without_heights_say_nothing_of_the_height_of_the_world():
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    given = gnss(truth, rng, sigma=0.02)
+    flat = {**given["positions"], "positions": [row[:2] for row in given["positions"]["positions"]]}
+    (line,) = (
+        line
+        for line in adjusted(segments, before, {**given, "positions": flat, "georeference": None}).meta["warnings"]
+        if "world.origin" in line
+    )
+    assert ", HEIGHT (not measured)]" in line
+
+
 @pytest.mark.parametrize(("east", "turn", "named"), [(0.0, 0.0, 0), (1.0, 0.0, 1), (0.0, 1.5, 1), (5e4, 30.0, 0)])
 def test_positions_contradict_a_stated_place(east, turn, named):
     truth, rng = winding(), np.random.default_rng(6)
