@@ -67,7 +67,10 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
     why = f"{len(shown)} of {len(levels)} pairs show ground"
     if others:
         up = ", ".join(f"{v + 0.0:.2f}" for v in others[0])
-        why += f", {len(others)} another plane (if it is the ground, state its normal [{up}] as world.up in a manifest)"
+        stated = f"state its normal [{up}] as world.up"
+        if np.min(np.array(others) @ others[0]) < math.cos(math.radians(MAX_TURN_DEG)):
+            stated = "the camera rolls from pair to pair: state an [attitude] or [imu], for world.up is one for all,"
+        why += f", {len(others)} another plane (if it is the ground, {stated} in a manifest)"
     if planes and not shown:
         best = max(planes, key=lambda plane: plane.share)
         why += (

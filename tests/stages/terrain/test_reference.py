@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rille.stages.geometry.geometry import RigidTransform
@@ -55,3 +56,10 @@ def test_the_reason_holds_the_figures() -> None:
     why = judge([ground(0.29, 3.2), OTHER], coarse=False).why
     figures = "0 of 2", "1 another plane", "29%", "3.2 camera heights", "40%", "[0.80, -0.60, 0.00]"
     assert [part for part in figures if part not in why] == []
+
+
+def test_a_camera_that_rolls_needs_an_attitude() -> None:
+    rolled = [{**WALL, "other_up": [-math.sin(a), -math.cos(a), 0.0]} for a in np.radians([60.0, 75.0])]
+    alike, differ = (judge(levels, coarse=False).why for levels in (rolled[:1] * 2, rolled))
+    assert "world.up in a manifest" in alike
+    assert "[attitude]" in differ
