@@ -226,7 +226,8 @@ class Sensors:
     def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
         """Say where the world lies in the frame of positions, unless that is stated."""
         there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ prior.laid).inverse()
-        origin, ahead = there.translation, there.rotation[:, 1]
+        # The first camera is the origin of a world with a place, though not of one on a plane that is no ground.
+        origin, ahead = there.apply(done.state.C[0]), there.rotation[:, 1]
         azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
         self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
         told = np.isfinite(prior.sigma)
