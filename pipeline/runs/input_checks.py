@@ -151,8 +151,8 @@ LIMITS = {
             "RIL-715",
             "largest motion, px",
             least=0.5,
-            remedy="if the camera moved, take frames farther apart; what moves along with it hides its motion: switch a "
-            "projector of dots off, mask its own body",
+            remedy="if the camera moved, take frames farther apart; what moves along with it hides its motion: switch "
+            "off a projector of dots, mask its own body",
         ),
     ),
 }
