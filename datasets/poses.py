@@ -69,8 +69,11 @@ WORDS = (
     (re.compile(r"theta"), lambda m: "yaw"),
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
-    (re.compile(r"up|height|alt|altitude|elevation"), lambda m: "z"),
+    (re.compile(r"up|height|alt|altitude|elevation|down|depth"), lambda m: "z"),
 )
+
+DOWNWARDS = re.compile(r"down|depth")
+"""Names of columns of z that count downwards, as those of NED frames and of vehicles under water."""
 
 
 # Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one.
@@ -163,8 +166,14 @@ def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> 
     rotations = _quaternions(table, columns) if columns.keys() >= set(QUATERNION) else _angles(table, columns)
     nothing = np.zeros((len(table.rows), 1))
     axes = [[columns[axis]] if axis in columns else [] for axis in POSITION]
-    positions = np.hstack([table.measures(axis, units.LENGTHS, unit) if axis else nothing for axis in axes])
+    positions = np.hstack([_lengths(table, axis, unit) if axis else nothing for axis in axes])
     return tuple(RigidTransform(R, t) for R, t in zip(rotations, positions, strict=True))
+
+
+def _lengths(table: TextTable, columns: Sequence[int], unit: float | None) -> Floats:
+    """Coordinates (n, columns), m, of which those that count downwards change their sign."""
+    signs = [-1.0 if table.header and DOWNWARDS.fullmatch(unitless(table.header[k])) else 1.0 for k in columns]
+    return table.measures(columns, units.LENGTHS, unit) * signs
 
 
 def of_images(path: Path) -> TextTable | None:
@@ -222,7 +231,7 @@ def positions_of(
     if "time" in meant:  # else rows are pairs
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
         times = times_of(table, meant["time"])
-    rows = table.measures(placed, units.LENGTHS, unit)
+    rows = _lengths(table, placed, unit)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 

@@ -384,7 +384,7 @@ class World(Table):
     crs : projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg.
     origin : m; easting, northing and height of the first left camera's centre in that CRS.
     azimuth_deg : degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y
-        axis; of a camera that looks straight down that of its images' upper edge.
+        axis; of a camera within 10 degrees of straight down that of its images' upper edge.
     """
 
     pitch_deg: float | None = Field(default=None, gt=-90, lt=90)
@@ -399,7 +399,8 @@ class World(Table):
             raise ValueError("up and pitch_deg both state the vertical: remove one of them")
         missing = [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
         if len(missing) in (1, 2):
-            raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
+            text = f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing"
+            raise ValueError(f"{text} (a run without all of them, but with [positions], states the latter two)")
         if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
             text = f"origin = {list(self.origin)} looks like degrees"
             raise ValueError(f"{text}: give easting, northing and height in {self.crs}, metres")

@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 from pydantic import TypeAdapter
@@ -31,6 +32,10 @@ from rille.pipeline.engine.runtime.hints import read_hint, write_hint
 from rille.pipeline.engine.runtime.private import private_folder
 
 OWN = ("rille.stages", "rille.datasets")
+
+_READING = Lock()
+"""Held while a source is parsed or the memory changes: runs in several threads share both, and Python 3.11 counts the
+depth of a syntax tree over all threads, so that it fails where two are made at once."""
 
 
 class _Source(NamedTuple):
@@ -82,7 +87,8 @@ def _memory() -> _Memory:
 
 def remember() -> None:
     """Write what was found in source files for later processes; a hint, never a matter of correctness."""
-    _memory().save()
+    with _READING:
+        _memory().save()
 
 
 @cache
@@ -189,17 +195,18 @@ def _file(module: str) -> Path | None:
 @cache
 def _read(name: str, path: Path) -> _Source:
     data = path.read_bytes()
-    memory = _memory()
-    known = memory.name(name, path, data)
-    memory.used.add(known)
-    if known not in memory.known:
-        tree = _Strip().visit(ast.parse(data))
-        # Relative imports count from the package: of an __init__ that is the module itself.
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
-        memory.known[known] = _Source(text, tuple(sorted(set(_imports(tree, package)))))
-        memory.new = True
-    return memory.known[known]
+    with _READING:
+        memory = _memory()
+        known = memory.name(name, path, data)
+        memory.used.add(known)
+        if known not in memory.known:
+            tree = _Strip().visit(ast.parse(data))
+            # Relative imports count from the package: of an __init__ that is the module itself.
+            package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+            text = hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+            memory.known[known] = _Source(text, tuple(sorted(set(_imports(tree, package)))))
+            memory.new = True
+        return memory.known[known]
 
 
 def _imports(tree: ast.AST, package: str) -> Iterator[str]:

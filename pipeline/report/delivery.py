@@ -211,7 +211,7 @@ def _reference(view: RunView) -> Items:
         f"{reason}elevations are distances from {whose} (normal [{normal}] in its camera's frame, "
         f"{metres(first['T_local_left'][11])} away), z points to the cameras; hazards and paths mean nothing there"
     )
-    if "world.up" not in reason:
+    if "world.up" not in reason and "locus.cell_size" not in reason:
         why += ". If that is the ground, state its normal as world.up in a manifest"
     return [_item("reference", "No ground, so neither hazards nor paths", why)]
 

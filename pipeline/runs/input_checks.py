@@ -147,6 +147,13 @@ LIMITS = {
     "motion": (  # tracking needs most of a left image in the next one
         Fault("RIL-666", "overlap", least=0.1, remedy="the trajectory breaks there; add frames between, or split it"),
         InputLimit("RIL-667", "overlap", least=0.4, remedy="take every frame, or expect weak poses there"),
+        InputLimit(
+            "RIL-715",
+            "largest motion, px",
+            least=0.5,
+            remedy="if the camera moved, take frames farther apart; what moves along with it hides its motion: switch "
+            "off a projector of dots, mask its own body",
+        ),
     ),
 }
 """Limits of the figures of each subject, the worst first."""
@@ -422,4 +429,4 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
         f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} % "
         f"from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
     )
-    return judge("motion", text, {"overlap": least})
+    return judge("motion", text, {"overlap": least, **({"largest motion, px": max(length)} if length else {})})

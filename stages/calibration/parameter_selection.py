@@ -206,8 +206,15 @@ class _Chooser:
     def _worth(self, correction: Floats) -> bool:
         """Whether a correction (5,) moves rows or depth by more than the usual error of a good calibration."""
         rows, depth = self._moves(correction)
-        # Points beyond infinity prove that depth is wrong, so a correction of any size counts.
-        return self.impossible or rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE
+        return rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE or self._explains(correction)
+
+    def _explains(self, correction: Floats) -> bool:
+        """Whether many matches lie beyond infinity, so that depth is surely wrong, and a correction (5,) explains them.
+
+        Noise that matches in a sky lies there with any.
+        """
+        # 0.03: largest share of matches beyond infinity that may remain after a correction that explains the others.
+        return self.impossible and impossible_share(corrected(self.rig, correction), self.pairs, self.all) < 0.03
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
         """Take up what the images change most, one after the other."""
@@ -240,13 +247,9 @@ class _Chooser:
         return any(k != i for k in chosen if k < ANGLES)
 
     def _infinity(self, i: int, chosen: list[int]) -> bool:
-        """Whether many matches lie beyond infinity, so that depth is surely wrong, and this parameter explains them."""
-        if not self.impossible:
-            return False
+        """Whether many matches lie beyond infinity, and this parameter explains them."""
         x, _, _ = self._solve([*chosen, i], rival=False)
-        free = np.isin(np.arange(RIG), [*chosen, i])
-        # 0.03: largest share of matches beyond infinity that may remain after a correction that explains the others.
-        return impossible_share(corrected(self.rig, np.where(free, x[:RIG], 0.0)), self.pairs, self.all) < 0.03
+        return self._explains(np.where(np.isin(np.arange(RIG), [*chosen, i]), x[:RIG], 0.0))
 
     def _asked(self, i: int, chosen: list[int]) -> _Asked:
         x, covariance, _ = self._solve([*chosen, i], rival=False)

@@ -101,6 +101,13 @@ def at_rest(poses: Floats, step_distance: Floats) -> bool:
     return bool(step_distance.size and rigid.spread(poses) < 10.0 * np.sqrt(np.mean(step_distance**2)))
 
 
+def leads_away(poses: Floats) -> bool:
+    """Whether the last position lies farther from the first than noise of steps would lead by chance."""
+    steps = np.diff(poses[:, :, 3], axis=0)
+    # 2.0: a random walk in three dimensions ends as far off, by the root of its squared steps, in 0.7 % of cases.
+    return bool(np.linalg.norm(steps.sum(axis=0)) > 2.0 * np.linalg.norm(steps))
+
+
 def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:
     """Bits of :data:`REASONS` for each frame that stands out, and the limit of each disagreement (None: no values).
 
@@ -169,7 +176,8 @@ def agreement_stage(
     length = float(np.linalg.norm(np.diff(ours[compared, :, 3], axis=0), axis=1)[there].sum())
     apart = {name: rms(values[np.isfinite(values), None]) for name, values in arrays.items() if name in REASONS}
     share: float | str | None = 100.0 * apart["distance"] / length if length > 0 else None
-    if at_rest(ours[compared], arrays["step_distance"][np.isfinite(arrays["step_distance"])]):
+    moves = leads_away(ours[compared]) or leads_away(arrays["poses"][compared])
+    if not moves and at_rest(ours[compared], arrays["step_distance"][np.isfinite(arrays["step_distance"])]):
         share = "the camera was at rest"
     of, after = "RMS disagreement of", "after one rotation and translation, no scale"
     best = "scale that would fit the crosscheck to ours best; 1 where both agree"

@@ -22,6 +22,7 @@ MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
 # Of a vertical against the normal of the ground: slopes are less, as far as a run's pairs see them.
 MAX_SLOPE_DEG = 15.0
 MIN_COSINE = np.cos(np.deg2rad(MAX_SLOPE_DEG))
+UNLESS = "unless all of that ground is such a slope,"
 
 
 @cache
@@ -89,19 +90,20 @@ def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float |
             f"world.pitch_deg = {stated:.3g} contradicts the images: by the ground that they show the camera looks "
             f"down by {found:.3g} degrees"
         )
-        return [line + (f"; with the other sign it is {rest:.2g} off" if reversed_fits else "; correct or remove it")]
+        remedy = f"with the other sign it is {rest:.2g} off" if reversed_fits else f"{UNLESS} correct or remove it"
+        return [f"{line}; {remedy}"]
     if off <= MAX_SLOPE_DEG:
         return []
     if axes is None:
         vertical = f"the stated vertical is {off:.0f} degrees off that of the ground which is seen"
-        return [f"{vertical}: correct up (its sign, too), the angles' unit or T_body_left"]
+        return [f"{vertical}: {UNLESS} correct up (its sign, too), the angles' unit or T_body_left"]
     a, b = axes @ given, axes @ seen
     fits = sorted((float(-b @ S @ a), k) for k, S in enumerate(signed_axes()) if b @ S @ a > MIN_COSINE)
     told = "; or ".join(dict.fromkeys(names(signed_axes()[k]) for _, k in fits[:3]))
     return [
-        f"the IMU contradicts the images: its up is {off:.0f} degrees off that of the ground which is seen; its x, y "
-        f"and z would have to be its {told or 'own, turned'} (gravity alone does not tell which): exchange its "
-        "columns, or correct T_imu_left"
+        f"the IMU contradicts the images: its up is {off:.0f} degrees off that of the ground which is seen; {UNLESS} "
+        f"its x, y and z would have to be its {told or 'own, turned'} (gravity alone does not tell which): exchange "
+        "its columns, or correct T_imu_left"
     ]
 
 

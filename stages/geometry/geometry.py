@@ -248,17 +248,22 @@ def orthonormal(matrix: ArrayLike) -> Floats:
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
 
+NADIR_DEG = 10.0
+"""Tilt up to which a camera counts as looking straight down (or up), so that its axis has no heading."""
+
+
 def level_rotation(up_in_camera: ArrayLike) -> Floats:
     """Rotation R_level_cam of the levelled frame: z up, y the horizontal projection of the optical axis, x right.
 
     Parameters
     ----------
-    up_in_camera : (3,) direction of "up" in the optical camera frame; along the optical axis, which then has no
-        horizontal projection, the top of the image lies ahead.
+    up_in_camera : (3,) direction of "up" in the optical camera frame; within :data:`NADIR_DEG` of the optical axis, of
+        which the horizontal projection then is where a mount or a gust tilts it, the top of the image lies ahead.
     """
     z = np.asarray(up_in_camera, dtype=np.float64)
     z = z / np.linalg.norm(z)
-    forward = np.array([0.0, 0.0, 1.0] if float(np.hypot(z[0], z[1])) >= 1e-6 else [0.0, -1.0, 0.0])
+    aside = math.sin(math.radians(NADIR_DEG))
+    forward = np.array([0.0, 0.0, 1.0] if float(np.hypot(z[0], z[1])) >= aside else [0.0, -1.0, 0.0])
     y = forward - z * float(z @ forward)
     y = y / float(np.linalg.norm(y))
     return np.array([np.cross(y, z), y, z], dtype=np.float64)

@@ -65,7 +65,10 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
     why = f"{len(shown)} of {len(levels)} pairs show ground"
     if others:
         up = ", ".join(f"{v + 0.0:.2f}" for v in others[0])
-        why += f", {len(others)} another plane (if it is the ground, state its normal [{up}] as world.up in a manifest)"
+        stated = f"state its normal [{up}] as world.up"
+        if np.min(np.array(others) @ others[0]) < math.cos(math.radians(MAX_TURN_DEG)):
+            stated = "the camera rolls from pair to pair: state an [attitude] or [imu], for world.up is one for all,"
+        why += f", {len(others)} another plane (if it is the ground, {stated} in a manifest)"
     if planes and not shown:
         best = max(planes, key=lambda plane: plane.share)
         why += (
@@ -73,6 +76,10 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
             f"camera heights, where {MIN_REFERENCE_SHARE:.0%} or {MIN_REACH_HEIGHTS:g} heights, a known vertical or "
             "another pair with the same plane would show ground (terrain.reference=ground takes it for that)"
         )
+    coarse_only = [facts for facts in levels if facts["plane"] and "no_ground" in facts]
+    if coarse_only and not planes:
+        share = coarse_only[0]["ground_share"]
+        why += f"; a plane that may be ground holds {share:.0%} of the matched pixels: {coarse_only[0]['no_ground']}"
     return GroundVerdict(len(shown) > len(others), why)
 
 

@@ -271,6 +271,14 @@ def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
     np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
 
 
+def test_positions_that_count_downwards_are_turned_upwards(tmp_path):
+    """North, east, down, as an IMU's maker has them, and the depth of a vehicle under water."""
+    for header in ("time,north,east,down", "time,northing,easting,depth [m]"):
+        (tmp_path / "p.csv").write_text(f"{header}\n0,5,2,3\n1,6,2,3.5\n")
+        found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
+        assert found.positions == ((2.0, 5.0, -3.0), (2.0, 6.0, -3.5))
+
+
 def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):
     (tmp_path / "p.csv").write_text("time,x_deg,y_deg\n1,15,47\n2,15,47\n")
     with raises("RIL-995", "x_deg"):

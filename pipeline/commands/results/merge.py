@@ -137,11 +137,14 @@ def _registered(first: Terrain, other: Terrain) -> Session:
     # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
     moved, pose = alignment.pose @ start.inverse(), alignment.pose
     motion = np.array([*(moved.apply(alignment.centre) - alignment.centre), *rotation_log(moved.rotation)])
+    by = placed.by
     if stated and (np.abs(motion) <= 3.0 * sigma).all():
         pose = start
+    elif stated:
+        by += f", {metres(float(np.linalg.norm(motion[:3])))} off by the elevations, which decide"
     facts = {
         "run": other.name,
-        "by": placed.by,
+        "by": by,
         "T_first_world": pose.to_list(),
         "sigma_m_rad": sigma.tolist(),
         "overlap": dem_comparison.figures(error),

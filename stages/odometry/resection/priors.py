@@ -153,7 +153,7 @@ class Sensors:
         clocks = self._clocks(groups, clocks, done, common)
         self._account(groups, clocks)
         if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
-            self._locate(done, positions.laid)
+            self._locate(done, positions)
             self._level(done)
         return whole, done
 
@@ -222,21 +222,24 @@ class Sensors:
                 count = f"{fact['left_out']} of {fact['measurements']}"
                 self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
 
-    def _locate(self, done: Adjusted, laid: RigidTransform) -> None:
-        """Say where the world lies in the frame of positions, unless that is stated; ``laid`` as of their prior."""
-        there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ laid).inverse()
-        origin, ahead = there.translation, there.rotation[:, 1]
+    def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
+        """Say where the world lies in the frame of positions, unless that is stated."""
+        there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ prior.laid).inverse()
+        # The first camera is the origin of a world with a place, though not of one on a plane that is no ground.
+        origin, ahead = there.apply(done.state.C[0]), there.rotation[:, 1]
         azimuth = math.degrees(math.atan2(ahead[0], ahead[1])) % 360.0
         self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
-        named = f"world.origin is [{', '.join(f'{v:.2f}' for v in origin)}] and world.azimuth_deg is {azimuth:.2f}"
+        told = np.isfinite(prior.sigma)
+        parts = (f"{v:.2f}" if known else "HEIGHT (not measured)" for v, known in zip(origin, told, strict=True))
+        named = f"world.origin is [{', '.join(parts)}] and world.azimuth_deg is {azimuth:.2f}"
         if self.georeference is None:
             self.lines.append(f"[positions] in their frame {named}: state these with world.crs, and maps lie there")
             return
         variances = np.diag(done.graph.covariance(done.state)[-1])
-        off = float(np.linalg.norm(origin - self.georeference["origin"]))
+        off = float(np.linalg.norm((origin - self.georeference["origin"])[told]))
         turn = math.radians(azimuth) - self.georeference["azimuth"]
         turn = abs(math.remainder(turn, math.tau))
-        apart = off > MIN_SIGMAS * math.sqrt(variances[:3].sum())
+        apart = off > MIN_SIGMAS * math.sqrt(variances[:3][told].sum())
         turned = turn > max(MIN_SIGMAS * math.sqrt(variances[5]), MIN_LEAN)
         # 1000.0: distance of the world's origin by positions from the stated one, from which on their frame is another
         # one.

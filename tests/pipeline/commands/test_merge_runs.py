@@ -75,7 +75,7 @@ def test_georeferences_of_one_lattice_resample_nothing(tmp_path: Path) -> None:
     # The same noise on the ground: the same cells.
     b = made_run(tmp_path / "b", Frame(FIRST.x + shift, FIRST.y, FIRST.z), there)
     assert merge(str(a), str(b), output=tmp_path / "out") == 0
-    assert facts(tmp_path / "out")["by"].startswith("georeferences")
+    assert facts(tmp_path / "out")["by"] == "georeferences"
     one, other = read_elevation_of(a), read_elevation_of(b)
     merged = read_elevation(tmp_path / "out" / "dem.tif")
     alone = merged.grid.values[:, -25:] - 700.0
@@ -83,6 +83,15 @@ def test_georeferences_of_one_lattice_resample_nothing(tmp_path: Path) -> None:
     assert merged.grid.values.shape == (one.shape[0], one.shape[1] + 25)
     assert np.nanmax(np.abs(alone - other[:, -25:])) < 0.3 * SIGMA
     assert np.nanmax(np.abs(merged.grid.values[:, :25] - 700.0 - one[:, :25])) < 1e-4  # float32 of heights
+
+
+def test_georeferences_that_elevations_contradict_are_said_to_be_off(tmp_path: Path) -> None:
+    a = made_run(tmp_path / "a", FIRST, Georeference("EPSG:32633", (5e5, 5.2e6, 700.0), 0.0))
+    b = made_run(tmp_path / "b", FIRST, Georeference("EPSG:32633", (5e5, 5.2e6, 677.0), 0.0), noise=2)
+    assert merge(str(a), str(b), output=tmp_path / "out") == 0
+    one = facts(tmp_path / "out")
+    assert one["by"] == "georeferences, 23.0 m off by the elevations, which decide"
+    assert abs(one["overlap"]["median"]) < 0.2 * SIGMA
 
 
 def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:

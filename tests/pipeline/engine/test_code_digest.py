@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -182,6 +185,25 @@ def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, memory,
     memory()
     assert package() == edited
     assert package("sibling.py", "6", "5") == first
+
+
+def test_one_source_is_parsed_at_a_time(package, memory, monkeypatch, tmp_path):
+    """Python 3.11 fails where two threads make syntax trees at once."""
+    parse, under_way, most = ast.parse, [], []
+
+    def slow(*given):
+        under_way.append(given)
+        most.append(len(under_way))
+        time.sleep(0.01)
+        under_way.pop()
+        return parse(*given)
+
+    monkeypatch.setattr(code_digest.ast, "parse", slow)
+    files = [tmp_path / "own_toy" / name for name in FILES]
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda path: code_digest._read(f"own_toy.{path.stem}", path), files))
+    assert len(most) > 4
+    assert max(most) == 1
 
 
 def test_a_damaged_memory_of_sources_is_none(package, memory, tmp_path):

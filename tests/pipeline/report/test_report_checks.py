@@ -26,6 +26,7 @@ from rille.pipeline.export import artifacts
 from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, summary
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import PathParams
@@ -57,12 +58,28 @@ def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
     assert page_.text.index("0.60 px") < page_.text.index("Accuracy Quantity")
 
 
-@pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (190_000.0, 1)])
+@pytest.mark.parametrize(("share", "told"), [(None, 0), (12.0, 0), (29.0, 1), (190_000.0, 1)])
 def test_a_crosscheck_that_is_wrong_as_a_whole_is_told(share: float | None, told: int) -> None:
     values = {"rmse": 512.3, "length": 0.27, "share": share}
     lines = summary._unlike({f"agreement_{name}": {"value": value} for name, value in values.items()})
     assert len(lines) == told
     assert all("512 m" in line and "0.270 m" in line for line in lines)
+
+
+@pytest.mark.parametrize(("step", "turn", "told"), [(0.0, 0.0, 1), (0.01, 0.0, 0), (0.0, 0.01, 0)])
+def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(step, turn, told) -> None:
+    """Who recorded it knows whether it stood, or whether a projector's dots moved with it."""
+    poses = np.tile(np.eye(3, 4), (5, 1, 1))
+    poses[1:4, :, 3] = np.random.default_rng(0).normal(scale=1e-4, size=(3, 3))
+    for k, pose in enumerate(poses):
+        pose[:, :3], pose[2, 3] = rotation_exp([0.0, k * turn, 0.0]), pose[2, 3] + k * step
+    covariance = np.tile(1e-8 * np.eye(6), (5, 1, 1))
+    meta = {"frames": list(range(5)), "pieces": [[0, 4]], "main": 0}
+    arrays = {"poses": poses, "covariance": covariance, "piece": np.zeros(5, np.int16)}
+    lines = summary._resting(Bundle(arrays, meta))
+    assert len(lines) == told
+    assert all("stands still" in line and "5 frames" in line for line in lines)
+    assert summary._resting(None) == []
 
 
 def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:

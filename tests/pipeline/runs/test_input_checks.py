@@ -224,5 +224,12 @@ def test_motion(overlap, level):
     assert "12.0 px" in found.text
 
 
+@pytest.mark.parametrize(("largest", "code"), [(0.3, "RIL-715"), (0.6, "")])
+def test_images_that_stand_still_are_named(largest, code):
+    """As those are on which the dots of a projector move along with the camera."""
+    motions = {(k, k + 1): {"overlap": 0.98, "median_length": v} for k, v in enumerate((0.1, largest))}
+    assert input_checks.judge_motion(motions, NAMES).code == code
+
+
 def test_one_frame_has_no_motion():
     assert input_checks.judge_motion({}, NAMES).level == "OK"

@@ -83,6 +83,17 @@ def test_matches_beyond_infinity_show_a_wrong_toe_in():
     assert not decide(rig, [matches(knocked(rig, yaw_deg=-0.8), far)], PARAMS).changed
 
 
+def test_noise_that_matches_in_a_sky_makes_no_change_worth_it():
+    """It lies beyond infinity, and no rig explains it."""
+    rig = street_rig()
+    pairs = [matches(rig, street_depth, pair=k) for k in range(3)]
+    for m in pairs:
+        m.right[::8, 0] = m.left[::8, 0] + np.linspace(2.0, 90.0, len(m.right[::8]))
+    chooser = parameter_selection._Chooser(rig, pairs, PARAMS)
+    assert chooser.impossible
+    assert not chooser._worth(np.array([5e-5, 0.0, 0.0, 0.0, 0.0]))
+
+
 @pytest.mark.parametrize("near", [False, True])
 def test_principal_point_that_the_rotation_made_up_for_is_not_mistaken_for_toe_in(near):
     """As found on KITTI: depth is right, rows show a keystone of half a pixel RMS."""

@@ -213,6 +213,13 @@ def test_of_a_camera_at_rest_no_share_of_the_way_is_stated() -> None:
     assert "at rest" in out.meta["metrics"]["share"]["how"]
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_camera_of_which_one_trajectory_drives_and_the_other_rests_is_not_at_rest(swapped: bool) -> None:
+    both = noisy(np.tile(np.eye(4)[:3], (10, 1, 1)), 1, shift=1e-3), drive(10)
+    share = run(*both[:: -1 if swapped else 1]).meta["metrics"]["share"]["value"]
+    assert share > (25.0 if swapped else 1000.0)  # per cent of our length, which is of noise where we rest
+
+
 def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     true = drive(20)
     ours = true.copy()

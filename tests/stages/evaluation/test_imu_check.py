@@ -84,6 +84,7 @@ def test_a_stated_vertical_off_the_ground_is_named():
     assert "stated vertical is 180 degrees off" in line
     (line,) = of_vertical(pitched(12.0, 8.0), pitched(-12.0, -8.0), None)
     assert "stated vertical is 20 degrees off" in line
+    assert "unless all of that ground is such a slope" in line
     # Slopes to both sides are those of the ground.
     assert of_vertical(pitched(0.0, 0.0), pitched(20.0, -20.0), None) == []
 
@@ -92,7 +93,7 @@ def test_a_stated_vertical_off_the_ground_is_named():
     ("stated", "seen", "words"),
     [
         (-12.0, (11.0, 12.0), "looks down by 11.5 degrees; with the other sign it is 0.5 off"),
-        (30.0, (11.0, 12.0), "looks down by 11.5 degrees; correct or remove it"),
+        (30.0, (11.0, 12.0), "looks down by 11.5 degrees; unless all of that ground is such a slope, correct or"),
         (-3.0, (4.0, 3.0), "with the other sign it is"),
     ],
 )

@@ -86,8 +86,10 @@ def test_level_rotation_of_a_camera_that_looks_down() -> None:
     np.testing.assert_allclose(R_level_cam @ up, [0, 0, 1], atol=1e-15)
     np.testing.assert_allclose(R_level_cam @ [0, 0, 1], [0, math.cos(pitch), -math.sin(pitch)], atol=1e-15)
     assert np.linalg.det(R_level_cam) == pytest.approx(1.0)
-    # Straight down: x right in the image, y to its top.
+    # Straight down: x right in the image, y to its top; wherever a gust tilts it.
     np.testing.assert_allclose(level_rotation([0.0, 0.0, -1.0]), [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-15)
+    for tilt in ([0.1, 0.0], [0.0, 0.1], [-0.1, 0.1]):
+        assert level_rotation([*tilt, -1.0])[1] @ [0, -1, 0] > 0.99
 
 
 def test_orthonormal_repairs_rounding() -> None:

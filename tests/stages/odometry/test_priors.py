@@ -217,7 +217,25 @@ def test_positions_say_where_the_world_lies():
     place = out.meta["priors"]["place"]
     assert [line for line in out.meta["warnings"] if "world.origin" in line and "world.azimuth_deg" in line]
     np.testing.assert_allclose(place["origin"], [4.5e5, 5.4e6, 300.0], atol=0.1)
+    # Nor is the first camera the origin of a world on a wall's plane.
+    up = np.array([0.0, 0.0, 20.0])
+    before.arrays["poses"] = before["poses"] + np.pad(up[:, None], ((0, 0), (3, 0)))
+    high = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": None})
+    np.testing.assert_allclose(high.meta["priors"]["place"]["origin"], place["origin"], atol=0.1)
     assert place["azimuth_deg"] == pytest.approx(360 - np.rad2deg(1.0), abs=1.0)
+
+
+def test_positions_without_heights_say_nothing_of_the_height_of_the_world():
+    truth, rng = winding(), np.random.default_rng(6)
+    segments, before = run_of(truth, rng)
+    given = gnss(truth, rng, sigma=0.02)
+    flat = {**given["positions"], "positions": [row[:2] for row in given["positions"]["positions"]]}
+    (line,) = (
+        line
+        for line in adjusted(segments, before, {**given, "positions": flat, "georeference": None}).meta["warnings"]
+        if "world.origin" in line
+    )
+    assert ", HEIGHT (not measured)]" in line
 
 
 @pytest.mark.parametrize(("east", "turn", "named"), [(0.0, 0.0, 0), (1.0, 0.0, 1), (0.0, 1.5, 1), (5e4, 30.0, 0)])

@@ -561,3 +561,4 @@ def test_the_scene_beside_and_behind_a_vehicle_tells_the_motion_even_where_it_sh
 def test_a_scene_that_ends_where_the_vehicle_is_does_not_tell_the_motion():
     found, _ = with_a_lorry(70, 30, farthest=11)
     assert "two motions" in found.facts[1]["lost"]
+    assert "mask what moves by itself" in found.facts[1]["contradiction"]  # nothing stands

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rille.stages.geometry.geometry import RigidTransform
@@ -48,9 +49,17 @@ def test_ground_is_what_pairs_show_with_evidence(levels: list[Any], shown: bool)
 def test_ground_too_far_for_the_rig_counts_where_a_cell_size_is_stated() -> None:
     far = ground(MIN_REFERENCE_SHARE, no_ground="too coarse")
     assert [judge([far], coarse=coarse).ground for coarse in (False, True)] == [False, True]
+    assert "40% of the matched pixels: too coarse" in judge([far, WALL], coarse=False).why
 
 
 def test_the_reason_holds_the_figures() -> None:
     why = judge([ground(0.29, 3.2), OTHER], coarse=False).why
     figures = "0 of 2", "1 another plane", "29%", "3.2 camera heights", "40%", "[0.80, -0.60, 0.00]"
     assert [part for part in figures if part not in why] == []
+
+
+def test_a_camera_that_rolls_needs_an_attitude() -> None:
+    rolled = [{**WALL, "other_up": [-math.sin(a), -math.cos(a), 0.0]} for a in np.radians([60.0, 75.0])]
+    alike, differ = (judge(levels, coarse=False).why for levels in (rolled[:1] * 2, rolled))
+    assert "world.up in a manifest" in alike
+    assert "[attitude]" in differ
