@@ -80,7 +80,6 @@ from rille.stages.facts.odometry import (
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
 from rille.stages.odometry.loops import loops_stage
@@ -140,24 +139,23 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("crosscheck", "crosscheck_join", *(("features",) if make.config.crosscheck.enabled else ())))
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
-    found = yield from screened(make, whole)
-    yield Complete(("image_quality", "swap_check", "frame_screening"))
-    # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
-    chain = list(found.meta["chain"])
+    screening = yield from screened(make, whole)
+    yield Complete(("image_quality", "frame_screening"))
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
-    lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
     row = {frame: k for k, frame in enumerate(frames)}
-    behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        chosen, rigs = yield from simultaneous(make, chain, behind, found.meta["unfit"])
+        found, chosen, rigs = yield from simultaneous(make, frames, whole, screening)
         if chosen is None:
             return
+        # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
+        chain = found.meta["chain"]
+        lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
         basic = [chain[i] for i in chosen.meta["basic"]]
-        yield Complete(("keyframes", "synchrony", "rig", "calibration"))
+        yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
         matched = yield from matched_pairs(make, rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
@@ -240,26 +238,20 @@ def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     return made[tuple(frames)]
 
 
-def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
-    """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
-    qualities = [
-        make.node(
-            image_quality_stage,
-            f"image_quality/{frame}",
-            left=make.image(frame, "left"),
-            right=make.image(frame, "right"),
-            frame=frame,
-        )
-        for frame in whole
-    ]
+def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
+    """Ask which frames are lost; while more is to be known for the answer, find that and ask again.
+
+    ``timed``: compare left and right of all frames, not only where the images ask for it.
+    """
+    qualities = [make.quality(frame) for frame in whole]
     along = steps(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
-    sides: dict[int, Handle] = {}
-    turn = 0
+    sides = {frame: make.sides(frame) for frame in whole} if timed else dict[int, Handle]()
+    which, turn = "/timed" if timed else "", 0
     while True:
         asked = make.node(
             frame_screening_stage,
-            f"frame_screening/{turn}" if turn else "frame_screening",
+            f"frame_screening{which}/{turn}" if turn else f"frame_screening{which}",
             frames=whole,
             bridged=list(bridges) or None,
             qualities=qualities,
@@ -278,19 +270,22 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[Screen
 
 
 def simultaneous(
-    make: Builder, chain: list[int], behind: list[int], unfit: list[int]
-) -> Generator[Wait, Any, tuple[Ref[KeyframesFacts] | None, dict[int, Handle[CalibrationFacts]]]]:
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
+) -> Generator[Wait, Any, tuple[Ref[ScreeningFacts], Ref[KeyframesFacts] | None, dict[int, Handle[CalibrationFacts]]]]:
     """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
 
+    The screening (``found`` before any pair was compared, made anew where some are of two times), the choice, the rigs.
     No choice where the images of most pairs contradict the rig, or each other: nothing is measured with these then.
-
-    Parameters
-    ----------
-    behind : places in the chain behind lost frames.
-    unfit : frames that may not be basic.
     """
-    p, mode, unfit = make.products, make.config.rig.mode, list(unfit)
+    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
+    row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
+        chain = found.meta["chain"]
+        behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
+        if (late := found.meta.get("late")) and not p.contradictions:
+            # The first ones tell where they begin to be late, others over the sequence by how much.
+            shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
+            p.contradictions.append(make.synchrony("synchrony/lost", shown, whole))
         # Each contradiction leads to another choice.
         which = f"/{len(p.contradictions)}" if p.contradictions else ""
         p.keyframes = make.node(
@@ -298,7 +293,7 @@ def simultaneous(
             f"keyframes{which}",
             steps=steps(make, chain),
             frames=len(chain),
-            unfit=sorted(chain.index(f) for f in unfit) or None,
+            unfit=[k for k, f in enumerate(chain) if f in wrong or f in found.meta["unfit"]] or None,
             behind=behind or None,
         )
         yield Complete(("motion", "step_table"))
@@ -315,17 +310,27 @@ def simultaneous(
             shown = spread(suspects, 12)
             asked = make.synchrony(f"synchrony{which}", shown, chain)
             p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
-            timed = yield from done(asked)
-            contradicted = any("contradiction" in one.meta for one in (timed, *judged))
+            apart = yield from done(asked)
+            partners = apart.meta["partners"]
+            if partners and not timed:
+                # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
+                timed = True
+                again = yield from screened(make, whole, timed)
+                if again.meta["lost"] != found.meta["lost"]:
+                    make.graph.outdated |= {one.index for one in (asked, *p.rigs.values())}
+                    found = again
+                    p.contradictions.clear()
+                    continue
+            contradicted = any("contradiction" in one.meta for one in (apart, *judged))
             if contradicted and 2 * len(suspects) > len(basic):
                 # A rig that images of two times show is none: a camera that moves in it did not.
-                p.rigs = {} if timed.meta["partners"] else p.rigs
-                return None, {}
-            if wrong := [pair for pair, _ in timed.meta["partners"]]:
-                unfit += wrong
+                p.rigs = {} if partners else p.rigs
+                return found, None, {}
+            if partners:
+                wrong |= {pair for pair, _ in partners}
                 continue
         if not any("knocked" in one.meta for one in judged):
-            return chosen, known
+            return found, chosen, known
         p.contradictions.append(p.rigs[basic[0]])
         # One calibration does not describe this rig: each pair has its own.
         mode = "per_pair"

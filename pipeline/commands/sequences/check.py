@@ -115,8 +115,7 @@ class Inspection:
         yield from self._first_pair(whole[0])
         yield from self._motions()
         if len(whole) > 1:
-            rows = yield self.make.synchrony("synchrony", spread(whole, 6), whole)
-            self.say(judge.judge_synchrony(rows.meta))
+            yield from self._times(whole)
 
     def _images(self) -> Steps:
         """Open every image: sizes, repetitions, exposure, sharpness."""
@@ -183,6 +182,17 @@ class Inspection:
         self.say(judge.judge_epipolar(oriented.meta))
         alike = yield self.make.repetition("repetition", [pair])
         self.say(judge.judge_repetition(alike.meta["repeated"]))
+
+    def _times(self, whole: list[int]) -> Steps:
+        """Whether left and right are of one time; where they are not, from which pair on."""
+        chosen, between = list[int](), whole
+        while between:
+            chosen = sorted({*chosen, *spread(between, 6)})
+            rows = yield self.make.synchrony(f"synchrony/{len(chosen)}", chosen, whole)
+            first = next((pair for pair, _ in rows.meta["partners"]), chosen[0])
+            last = max((pair for pair in chosen if pair < first), default=first)
+            between = [k for k in whole if last < k < first]
+        self.say(judge.judge_synchrony(rows.meta))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
