@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, grey_rows
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -216,7 +216,7 @@ def frame_screening_stage(
 ) -> Bundle[ScreeningFacts]:
     """Which frames are lost, and which may not be basic."""
     along = steps_of(steps)
-    seen = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
+    seen: dict[int, Mapping[str, Any]] = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
     shares = {s: step.match_rate for s, step in zip(pairwise(frames), along, strict=True)}
     shares |= {(a, b): Step.from_bundle(m).match_rate for (a, b), m in zip(bridged, bridges, strict=True)}
     changes = [a.change(b) for a, b in pairwise(along)]
@@ -237,5 +237,6 @@ def frame_screening_stage(
         meta["warnings"] = [
             *(f"frame {b} repeats the left image of frame {a}: no motion between them" for a, b in found.repeated),
             *(f"frame {f} is not used as basic pair: {unfit[f]}" for f in chain if f in unfit),
+            *grey_rows({side: [seen[f][side] for f in frames if f not in found.lost] for side in SIDES}),
         ]
     return Bundle({}, meta)
