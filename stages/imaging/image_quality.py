@@ -97,10 +97,10 @@ def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     for side, other in (("left", "right"), ("right", "left")):
         odd = shares[side] - shares[other] > MAX_GREY_ROWS
         if odd.any():
+            which = f"{int(odd.sum())} of {len(odd)} {side} images"
             rows = f"show one grey value in {shares[side][odd].mean():.0%} of their rows"
             lines.append(
-                f"{int(odd.sum())} of {len(odd)} {side} images {rows}, the {other} ones do not: nothing is measured there; "
-                "did sensor or transmission fail?"
+                f"{which} {rows}, the {other} ones do not: nothing is measured there; did sensor or transmission fail?"
             )
     return lines
 
