@@ -54,6 +54,7 @@ import math
 from collections import Counter
 from collections.abc import Generator, Mapping
 from collections.abc import Sequence as Series
+from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -67,7 +68,7 @@ from rille.pipeline.flow.builders import BasicPair, Builder, Pair, Segment, cent
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
-from rille.stages.facts.calibration import CalibrationFacts, RigFacts
+from rille.stages.facts.calibration import CalibrationFacts, RigFacts, SynchronyFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
     IntrinsicsFacts,
@@ -106,6 +107,11 @@ SEAMS = 24
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
 half a degree off two."""
+
+ODD = (
+    "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
+)
+"""Cause of a frame that is lost by its rig."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -148,15 +154,15 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found, chosen, rigs = yield from simultaneous(make, frames, whole, screening)
+        found = yield from simultaneous(make, frames, whole, screening)
+        chain, chosen = found.chain, found.keyframes
         if chosen is None:
             return
         # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
-        chain = found.meta["chain"]
-        lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
+        lost = sorted([*missing, *found.lost], key=lambda item: item["frame"])
         basic = [chain[i] for i in chosen.meta["basic"]]
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, rigs)
+        matched = yield from matched_pairs(make, found.rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
@@ -269,23 +275,35 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
         turn += 1
 
 
+@dataclass(frozen=True)
+class Simultaneous:
+    """Frames of the ``chain``, those that are ``lost`` (frame and cause), basic pairs, None where nothing can be
+    measured, and the rig of each."""
+
+    chain: list[int]
+    lost: list[dict[str, Any]]
+    keyframes: Ref[KeyframesFacts] | None
+    rigs: dict[int, Handle[CalibrationFacts]]
+
+
 def simultaneous(
     make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
-) -> Generator[Wait, Any, tuple[Ref[ScreeningFacts], Ref[KeyframesFacts] | None, dict[int, Handle[CalibrationFacts]]]]:
+) -> Generator[Wait, Any, Simultaneous]:
     """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
 
-    The screening (``found`` before any pair was compared, made anew where some are of two times), the choice, the rigs.
-    No choice where the images of most pairs contradict the rig, or each other: nothing is measured with these then.
+    Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
+    not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
+    each other: nothing is measured with these then.
     """
-    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
+    p, mode, wrong, odd = make.products, make.config.rig.mode, set[int](), set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
-        chain = found.meta["chain"]
+        chain = [f for f in found.meta["chain"] if f not in odd]
+        lost = [*found.meta["lost"], *({"frame": f, "cause": ODD} for f in sorted(odd))]
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
-        if (late := found.meta.get("late")) and not p.contradictions:
-            # The first ones tell where they begin to be late, others over the sequence by how much.
-            shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
-            p.contradictions.append(make.synchrony("synchrony/lost", shown, whole))
+        late = found.meta.get("late", [])
+        if late and not p.contradictions:
+            p.contradictions.append(lost_by_time(make, late, whole))
         # Each contradiction leads to another choice.
         which = f"/{len(p.contradictions)}" if p.contradictions else ""
         p.keyframes = make.node(
@@ -325,15 +343,31 @@ def simultaneous(
             if contradicted and 2 * len(suspects) > len(basic):
                 # A rig that images of two times show is none: a camera that moves in it did not.
                 p.rigs = {} if partners else p.rigs
-                return found, None, {}
+                if late and partners:
+                    p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
+                return Simultaneous(chain, lost, None, {})
             if partners:
                 wrong |= {pair for pair, _ in partners}
                 continue
+        fitting = {one["pair"] for rig in judged for one in rig.meta.get("per_pair", ())}.difference(suspects)
+        bad = set(spread(basic, 200) if pooled else basic) - fitting
+        # A rig that moved did so for the next pairs, too.
+        if alone := [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]:
+            make.graph.outdated |= {one.index for one in p.rigs.values()}
+            odd |= set(alone)
+            continue
         if not any("knocked" in one.meta for one in judged):
-            return found, chosen, known
+            return Simultaneous(chain, lost, chosen, known)
         p.contradictions.append(p.rigs[basic[0]])
         # One calibration does not describe this rig: each pair has its own.
         mode = "per_pair"
+
+
+def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
+    """Which right images are of the time of some left ones: of the first, which tell where they begin to be late, and
+    of others over the sequence, by how much."""
+    shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
+    return make.synchrony(f"synchrony/lost/{len(late)}", shown, whole)
 
 
 def matched_pairs(

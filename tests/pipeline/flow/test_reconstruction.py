@@ -271,9 +271,38 @@ def test_behind_an_image_that_one_camera_lost_all_frames_are_lost_and_those_befo
     assert len(labels(graph, "swap_check")) == FRAMES
     assert products.trajectory is not None
     assert products.trajectory.spec.args["lost"] == late["lost"]
-    assert [h.label for h in products.contradictions] == ["synchrony/lost", "intrinsics"]
+    assert [h.label for h in products.contradictions] == ["synchrony/lost/5", "intrinsics"]
     assert products.contradictions[0].spec.args["pairs"] == [3, 4, 5, 6, 7]
     assert {h.label for h in graph.nodes if h.index in graph.outdated} == {"rig", "synchrony"}
+
+
+@pytest.mark.parametrize("few", [True, False], ids=["few matches", "bad rows"])
+def test_one_pair_that_does_not_fit_the_rig_of_its_neighbours_is_lost_and_bridged(few: bool) -> None:
+    """A torn image, or one of another scene or time, in one camera."""
+    judged = {"per_pair": [{"pair": k} for k in (0, 5, 6)]} if few else {"suspects": [3]}
+    if not few:
+        judged["per_pair"] = [{"pair": k} for k in (0, 3, 5, 6)]
+    again: dict[str, Any] = {"basic": [0, 2, 5], "segments": [[0, 1, 2], [2, 3, 4, 5], [5, 6]]}
+    doubts = [
+        ("rig", judged),
+        *([] if few else [("synchrony", {"partners": []})]),
+        ("keyframes", again | {"displacement": [1.0] * 6, "match_rate": [1.0] * 6}),
+        ("rig", {"per_pair": [{"pair": k} for k in (0, 2, 6)]}),
+    ]
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert products.trajectory is not None
+    (lost,) = products.trajectory.spec.args["lost"]
+    assert lost["frame"] == 3
+    assert "do not fit each other" in lost["cause"]
+    assert list(products.world_dem) == [0, 2, 6]
+    assert "motion/2-4" in labels(graph, "motion")
+    assert "rig" in {h.label for h in graph.nodes if h.index in graph.outdated}
+
+
+def test_two_pairs_in_a_row_that_do_not_fit_may_be_a_rig_that_moved() -> None:
+    doubts: list[tuple[str, dict[str, Any]]] = [("rig", {"per_pair": [{"pair": 0}, {"pair": 6}]})]
+    _, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert list(products.world_dem) == [0, 3, 5, 6]
 
 
 def test_rows_that_no_other_moment_explains_change_nothing() -> None:
