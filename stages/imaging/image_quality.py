@@ -57,7 +57,7 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
     ``mean`` (None: nothing is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped pixels;
-    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels; where there are any, share
+    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels; where they are many, share
     ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
@@ -83,7 +83,7 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "sharpness": float(np.median(sharp)) if sharp else None,
         "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
-        **({"grey_rows": one} if one else {}),
+        **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
 
 
