@@ -351,8 +351,9 @@ def simultaneous(
                 continue
         fitting = {one["pair"] for rig in judged for one in rig.meta.get("per_pair", ())}.difference(suspects)
         bad = set(spread(basic, 200) if pooled else basic) - fitting
-        # A rig that moved did so for the next pairs, too.
-        if alone := [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]:
+        # A rig that moved did so for the next pairs, too; one that images of two times or many pairs bend judges none.
+        alone = [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]
+        if alone and not late and 4 * len(bad) <= len(basic):
             make.graph.outdated |= {one.index for one in p.rigs.values()}
             odd |= set(alone)
             continue
