@@ -60,6 +60,7 @@ NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], 
     (opencv.is_message, opencv.message),
     (has(*opencv.SINGLE), opencv.single),
     (opencv.projections_alone, opencv.projections),
+    (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
 )
 """Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""
 

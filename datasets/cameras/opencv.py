@@ -79,6 +79,17 @@ def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
     return [side for side in sides if side is not None]
 
 
+def reprojection(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of rectified images by ``Q`` of OpenCV's ``stereoRectify``, which takes disparities to points."""
+    Q = f.matrix("Q", 4, 4)
+    if not (Q[2, 3] > 0 and Q[3, 2]):
+        raise f.error("RIL-678", "Q", f"has the focal length {Q[2, 3]:g} and the inverse baseline {Q[3, 2]:g}")
+    across = -1.0 / Q[3, 2]
+    for key, column, shift in (("P1", -Q[0, 3], 0.0), ("P2", -Q[0, 3] - Q[3, 3] * across, across)):
+        f.values[key] = [Q[2, 3], 0.0, column, shift * Q[2, 3], 0.0, Q[2, 3], -Q[1, 3], 0.0, 0.0, 0.0, 1.0, 0.0]
+    return projections(f, path)
+
+
 def is_message(f: Fields) -> bool:
     """Whether these are the fields of ROS' message camera_info."""
     return "distortion_model" in f and any(all(key in f for key in keys) for keys in (MESSAGE, map(str.lower, MESSAGE)))

@@ -34,12 +34,13 @@ from rille.stages.facts.calibration import (
     SwapFacts,
     SynchronyFacts,
 )
-from rille.stages.facts.imaging import PyramidFacts
+from rille.stages.facts.imaging import PyramidFacts, QualityFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.features import features_stage
+from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
@@ -234,6 +235,12 @@ class Builder:
         """SIFT features."""
         return self.node(features_stage, f"features/{camera}/{frame}", image=self.image(frame, camera))
 
+    @once
+    def quality(self, frame: int) -> Handle[QualityFacts]:
+        """Grey values and sharpness of a pair."""
+        images = {camera: self.image(frame, camera) for camera in CAMERAS}
+        return self.node(image_quality_stage, f"image_quality/{frame}", **images, frame=frame)
+
     # -- what two images show -----------------------------------------------------------------------------------
 
     @once
@@ -242,6 +249,7 @@ class Builder:
         images = {"a": self.pyramid(a, "left"), "b": self.pyramid(b, "left")}
         return self.node(motion_stage, f"motion/{a}-{b}", **images)
 
+    @once
     def sides(self, frame: int) -> Handle[SwapFacts]:
         """Whether the images of a pair are exchanged."""
         images = {camera: self.features(frame, camera) for camera in CAMERAS}

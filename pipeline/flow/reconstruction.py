@@ -54,6 +54,7 @@ import math
 from collections import Counter
 from collections.abc import Generator, Mapping
 from collections.abc import Sequence as Series
+from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -67,7 +68,7 @@ from rille.pipeline.flow.builders import BasicPair, Builder, Pair, Segment, cent
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
-from rille.stages.facts.calibration import CalibrationFacts, RigFacts
+from rille.stages.facts.calibration import CalibrationFacts, RigFacts, SynchronyFacts
 from rille.stages.facts.evaluation import JoinFacts
 from rille.stages.facts.odometry import (
     IntrinsicsFacts,
@@ -80,7 +81,6 @@ from rille.stages.facts.odometry import (
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
 from rille.stages.odometry.loops import loops_stage
@@ -107,6 +107,11 @@ SEAMS = 24
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
 half a degree off two."""
+
+ODD = (
+    "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
+)
+"""Cause of a frame that is lost by its rig."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -140,25 +145,24 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("crosscheck", "crosscheck_join", *(("features",) if make.config.crosscheck.enabled else ())))
 
     # Frames that the trajectory goes through, and which of them are basic pairs.
-    found = yield from screened(make, whole)
-    yield Complete(("image_quality", "swap_check", "frame_screening"))
-    # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
-    chain = list(found.meta["chain"])
+    screening = yield from screened(make, whole)
+    yield Complete(("image_quality", "frame_screening"))
     missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
-    lost = sorted([*missing, *found.meta["lost"]], key=lambda item: item["frame"])
     row = {frame: k for k, frame in enumerate(frames)}
-    behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        chosen, rigs = yield from simultaneous(make, chain, behind, found.meta["unfit"])
+        found = yield from simultaneous(make, frames, whole, screening)
+        chain, chosen = found.chain, found.keyframes
         if chosen is None:
             return
+        # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
+        lost = sorted([*missing, *found.lost], key=lambda item: item["frame"])
         basic = [chain[i] for i in chosen.meta["basic"]]
-        yield Complete(("keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, rigs)
+        yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
+        matched = yield from matched_pairs(make, found.rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
@@ -242,26 +246,20 @@ def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     return made[tuple(frames)]
 
 
-def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
-    """Ask which frames are lost; while more is to be known for the answer, find that and ask again."""
-    qualities = [
-        make.node(
-            image_quality_stage,
-            f"image_quality/{frame}",
-            left=make.image(frame, "left"),
-            right=make.image(frame, "right"),
-            frame=frame,
-        )
-        for frame in whole
-    ]
+def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
+    """Ask which frames are lost; while more is to be known for the answer, find that and ask again.
+
+    ``timed``: compare left and right of all frames, not only where the images ask for it.
+    """
+    qualities = [make.quality(frame) for frame in whole]
     along = steps(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
-    sides: dict[int, Handle] = {}
-    turn = 0
+    sides = {frame: make.sides(frame) for frame in whole} if timed else dict[int, Handle]()
+    which, turn = "/timed" if timed else "", 0
     while True:
         asked = make.node(
             frame_screening_stage,
-            f"frame_screening/{turn}" if turn else "frame_screening",
+            f"frame_screening{which}/{turn}" if turn else f"frame_screening{which}",
             frames=whole,
             bridged=list(bridges) or None,
             qualities=qualities,
@@ -279,20 +277,35 @@ def screened(make: Builder, whole: list[int]) -> Generator[Wait, Any, Ref[Screen
         turn += 1
 
 
+@dataclass(frozen=True)
+class Simultaneous:
+    """Frames of the ``chain``, those that are ``lost`` (frame and cause), basic pairs, None where nothing can be
+    measured, and the rig of each."""
+
+    chain: list[int]
+    lost: list[dict[str, Any]]
+    keyframes: Ref[KeyframesFacts] | None
+    rigs: dict[int, Handle[CalibrationFacts]]
+
+
 def simultaneous(
-    make: Builder, chain: list[int], behind: list[int], unfit: list[int]
-) -> Generator[Wait, Any, tuple[Ref[KeyframesFacts] | None, dict[int, Handle[CalibrationFacts]]]]:
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
+) -> Generator[Wait, Any, Simultaneous]:
     """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
 
-    No choice where the images of most pairs contradict the rig, or each other: nothing is measured with these then.
-
-    Parameters
-    ----------
-    behind : places in the chain behind lost frames.
-    unfit : frames that may not be basic.
+    Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
+    not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
+    each other: nothing is measured with these then.
     """
-    p, mode, unfit = make.products, make.config.rig.mode, list(unfit)
+    p, mode, wrong, odd = make.products, make.config.rig.mode, set[int](), set[int]()
+    row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
+        chain = [f for f in found.meta["chain"] if f not in odd]
+        lost = [*found.meta["lost"], *({"frame": f, "cause": ODD} for f in sorted(odd))]
+        behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
+        late = found.meta.get("late", [])
+        if late and not p.contradictions:
+            p.contradictions.append(lost_by_time(make, late, whole))
         # Each contradiction leads to another choice.
         which = f"/{len(p.contradictions)}" if p.contradictions else ""
         p.keyframes = make.node(
@@ -300,7 +313,7 @@ def simultaneous(
             f"keyframes{which}",
             steps=steps(make, chain),
             frames=len(chain),
-            unfit=sorted(chain.index(f) for f in unfit) or None,
+            unfit=[k for k, f in enumerate(chain) if f in wrong or f in found.meta["unfit"]] or None,
             behind=behind or None,
         )
         yield Complete(("motion", "step_table"))
@@ -317,20 +330,47 @@ def simultaneous(
             shown = spread(suspects, 12)
             asked = make.synchrony(f"synchrony{which}", shown, chain)
             p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
-            timed = yield from done(asked)
-            contradicted = any("contradiction" in one.meta for one in (timed, *judged))
+            apart = yield from done(asked)
+            partners = apart.meta["partners"]
+            if partners and not timed:
+                # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
+                timed = True
+                again = yield from screened(make, whole, timed)
+                if again.meta["lost"] != found.meta["lost"]:
+                    make.graph.outdated |= {one.index for one in (asked, *p.rigs.values())}
+                    found = again
+                    p.contradictions.clear()
+                    continue
+            contradicted = any("contradiction" in one.meta for one in (apart, *judged))
             if contradicted and 2 * len(suspects) > len(basic):
                 # A rig that images of two times show is none: a camera that moves in it did not.
-                p.rigs = {} if timed.meta["partners"] else p.rigs
-                return None, {}
-            if wrong := [pair for pair, _ in timed.meta["partners"]]:
-                unfit += wrong
+                p.rigs = {} if partners else p.rigs
+                if late and partners:
+                    p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
+                return Simultaneous(chain, lost, None, {})
+            if partners:
+                wrong |= {pair for pair, _ in partners}
                 continue
+        fitting = {one["pair"] for rig in judged for one in rig.meta.get("per_pair", ())}.difference(suspects)
+        bad = set(spread(basic, 200) if pooled else basic) - fitting
+        # A rig that moved did so for the next pairs, too; one that images of two times or many pairs bend judges none.
+        alone = [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]
+        if alone and not late and 4 * len(bad) <= len(basic):
+            make.graph.outdated |= {one.index for one in p.rigs.values()}
+            odd |= set(alone)
+            continue
         if not any("knocked" in one.meta for one in judged):
-            return chosen, known
+            return Simultaneous(chain, lost, chosen, known)
         p.contradictions.append(p.rigs[basic[0]])
         # One calibration does not describe this rig: each pair has its own.
         mode = "per_pair"
+
+
+def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
+    """Which right images are of the time of some left ones: of the first, which tell where they begin to be late, and
+    of others over the sequence, by how much."""
+    shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
+    return make.synchrony(f"synchrony/lost/{len(late)}", shown, whole)
 
 
 def matched_pairs(

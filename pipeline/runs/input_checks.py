@@ -22,6 +22,7 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between, lengths_along
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.hfvm.given import MAX_REPEATED_SHARE
+from rille.stages.imaging.image_quality import grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 Level = Literal["OK", "WARN", "FAIL"]
@@ -86,6 +87,8 @@ LIMITS = {
         InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
         Fault("RIL-670", "unusable", most=0, remedy="mend, convert or remove what is wrong"),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
+        InputLimit("RIL-677", "grey", most=0),
+        Fault("RIL-676", "mirrored", most=0, remedy="mirror that camera's images back"),
         InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),
     "exposure": (
@@ -321,6 +324,9 @@ def judge_looks(
     out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names, limits) if bad.level != "OK"]
     judged = {bad.subject for bad in out}
     both = [k for k in opened.get("left", {}) if k in opened.get("right", {})]
+    if both:
+        lines = grey_rows({camera: [of[k] for k in both] for camera, of in opened.items()})
+        out += [judge("images", line, {"grey": 1}) for line in lines]
     if both and "exposure" not in judged:
         left, right = (_figure({k: opened[camera][k] for k in both}, "mean") for camera in ("left", "right"))
         # At least one grey level: the ratio of two black images means nothing.

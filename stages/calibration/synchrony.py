@@ -7,6 +7,7 @@ simultaneous image do not. At rest all fit equally, and no finding results.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -52,13 +53,27 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> Synchro
             partners[pair] = other
     facts: SynchronyFacts = {"rows": rows, "partners": [list(item) for item in partners.items()]}
     if partners:
-        shifts = {other - pair for pair, other in partners.items()}
-        which = ", ".join(f"left {pair} with right {other}" for pair, other in partners.items())
-        if len(partners) > 2 and len(shifts) == 1:
-            which = f"left i with right i{shifts.pop():+d}"
+        which, anew = _shifts(partners)
         line = f"left and right are not of one time: by its rows, {which} is simultaneous"
+        if anew:
+            line += f"; if a camera lost an image there and counted on, add {anew}"
         facts["contradiction"], facts["warnings"] = line, [line]
     return facts
+
+
+def _shifts(partners: Mapping[int, int]) -> tuple[str, str]:
+    """Which right image is that of which left one, in words, together of three pairs or more that are off by as many
+    frames; and of these what to add to the numbers of which images."""
+    which, anew = [], []
+    for shift, pairs in groupby(partners, lambda pair: partners[pair] - pair):
+        run = list(pairs)
+        if len(run) < 3:
+            which += [f"left {pair} with right {pair + shift}" for pair in run]
+            continue
+        which.append(f"left i with right i{shift:+d} (i = {run[0]} to {run[-1]})")
+        side, first = ("left", run[0]) if shift > 0 else ("right", run[0] + shift)
+        anew.append(f"{abs(shift)} to the numbers of the {side} images from {first} on")
+    return ", ".join(which), ", ".join(anew)
 
 
 @stage("synchrony")

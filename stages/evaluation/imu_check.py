@@ -42,13 +42,15 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     axes : (3, 3) R_imu_left.
     """
     both = posed(images) & posed(sensor)
-    if both.sum() <= 5:
+    # Behind a gap a sensor's attitude, and a trajectory, may begin anew.
+    step = both[:-1] & both[1:]
+    if step.sum() < 5:
         return []
-    steps = (np.swapaxes(R[both][:-1], 1, 2) @ R[both][1:] for R in (images, sensor))
+    steps = (np.swapaxes(R[:-1][step], 1, 2) @ R[1:][step] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
     # A bias turns the sensor, too, by 0.15 rad/s at most; a unit of degrees would make it small.
-    fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + 0.15 * np.median(np.diff(times[both]))
+    fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + 0.15 * np.median(np.diff(times)[step])
     readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:

@@ -26,13 +26,14 @@ class ScreeningFacts(Facts):
     """Frames that the trajectory goes through, and those that it does not.
 
     ``asks``: what must be known for an answer, ``bridges`` (pairs of frames) and ``sides`` (frames); where both are
-    empty the rest is final. ``lost`` are frame and cause, ``unfit`` frames that may not be basic, ``match_rate`` the
-    shares along the ``chain``.
+    empty the rest is final. ``lost`` are frame and cause, ``late`` those of them whose left and right are not of one
+    time, ``unfit`` frames that may not be basic, ``match_rate`` the shares along the ``chain``.
     """
 
     asks: dict[str, list[Any]]
     chain: list[int]
     lost: list[dict[str, Any]]
+    late: NotRequired[list[int]]
     unfit: list[int]
     match_rate: list[float | None]
 

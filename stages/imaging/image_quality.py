@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -21,6 +22,9 @@ from rille.stages.imaging.pyramid import grey
 
 MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
+
+MAX_GREY_ROWS = 0.1
+"""Share of the rows of an image that show one grey value, beyond those of the other camera's, that is no chance."""
 
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
@@ -53,7 +57,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
     ``mean`` (None: nothing is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped pixels;
-    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels.
+    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels; where they are many, share
+    ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
     # (0.25, 0.5, 0.75): of the height: where the strips lie whose sharpness stands for the image's.
@@ -67,6 +72,9 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
     (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(thinned, mask=mask))
     usable = thinned[mask != 0]
+    least, most = (np.where(mask != 0, thinned, far) for far in (np.inf, -np.inf))
+    least, most = least.min(axis=1), most.max(axis=1)
+    one = float(((least == most) & (least > MAX_DARK_GREY) & (least < MIN_BRIGHT_GREY)).mean())
     return {
         "mean": float(mean) if usable.size else None,
         "deviation": float(deviation),
@@ -75,7 +83,26 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "sharpness": float(np.median(sharp)) if sharp else None,
         "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
+        **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
+
+
+def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Say of which camera images have rows of one grey value that the other's of the same frames have not.
+
+    ``sides``: figures of :func:`glance` of the left and of the right images. A sky of one value is in both.
+    """
+    lines = []
+    shares = {side: np.array([seen.get("grey_rows", 0.0) for seen in looks]) for side, looks in sides.items()}
+    for side, other in (("left", "right"), ("right", "left")):
+        odd = shares[side] - shares[other] > MAX_GREY_ROWS
+        if odd.any():
+            which = f"{int(odd.sum())} of {len(odd)} {side} images"
+            rows = f"show one grey value in {shares[side][odd].mean():.0%} of their rows"
+            lines.append(
+                f"{which} {rows}, the {other} ones do not: nothing is measured there; did sensor or transmission fail?"
+            )
+    return lines
 
 
 @stage("image_quality")

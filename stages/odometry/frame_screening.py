@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, grey_rows
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -69,10 +69,11 @@ class FrameScreeningParams(Params):
 
 @dataclass
 class Judgement:
-    """``lost``, ``unfit``: cause by frame. ``repeated``: pairs of successive frames with equal images. ``asks``: see
-    the module."""
+    """``lost``, ``unfit``: cause by frame. ``late``: lost ones, left and right of which are not of one time.
+    ``repeated``: pairs of successive frames with equal images. ``asks``: see the module."""
 
     lost: dict[int, str] = field(default_factory=dict)
+    late: list[int] = field(default_factory=list)
     unfit: dict[int, str] = field(default_factory=dict)
     repeated: list[tuple[int, int]] = field(default_factory=list)
     asks: Asks = field(default_factory=lambda: {"bridges": [], "sides": []})
@@ -107,6 +108,7 @@ def judge(
         elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
             words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
             out.lost.setdefault(f, f"{words} {best:.0%})")
+            out.late.append(f)
     doubted = set(jumps) | _neighbours(frames, out.lost.keys() & sides.keys())
     out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
     chain = [f for f in frames if f not in out.lost]
@@ -214,7 +216,7 @@ def frame_screening_stage(
 ) -> Bundle[ScreeningFacts]:
     """Which frames are lost, and which may not be basic."""
     along = steps_of(steps)
-    seen = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
+    seen: dict[int, Mapping[str, Any]] = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
     shares = {s: step.match_rate for s, step in zip(pairwise(frames), along, strict=True)}
     shares |= {(a, b): Step.from_bundle(m).match_rate for (a, b), m in zip(bridged, bridges, strict=True)}
     changes = [a.change(b) for a, b in pairwise(along)]
@@ -229,9 +231,12 @@ def frame_screening_stage(
         "unfit": [f for f in chain if f in unfit],
         "match_rate": [shares[s] for s in pairwise(frames)],
     }
+    if found.late:
+        meta["late"] = sorted(found.late)
     if not any(found.asks.values()):
         meta["warnings"] = [
             *(f"frame {b} repeats the left image of frame {a}: no motion between them" for a, b in found.repeated),
             *(f"frame {f} is not used as basic pair: {unfit[f]}" for f in chain if f in unfit),
+            *grey_rows({side: [seen[f][side] for f in frames if f not in found.lost] for side in SIDES}),
         ]
     return Bundle({}, meta)

@@ -5,7 +5,7 @@ Many scenes hold a level plane that is no ground: a floor under shelves, a table
 - the vertical is known, and the plane is level but for :data:`MAX_TILT_DEG`; or
 - the ground is stated, or holds :data:`MIN_REFERENCE_SHARE` of the pair's matched pixels; or
 - it is open ground, seen as far as :data:`MIN_REACH_HEIGHTS` camera heights; or
-- another pair shows the same plane: its normal turned by at most 10 degrees in the camera's frame, and the
+- another pair shows the same plane: its normal turned by at most :data:`MAX_TURN_DEG` in the camera's frame, and the
   camera's height alike to a quarter. A vehicle carries its cameras so.
 
 Pairs that show ground must outnumber those whose matched pixels lie on another plane.
@@ -30,6 +30,7 @@ from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL
 MAX_TILT_DEG = 10.0
 MIN_REFERENCE_SHARE = 0.4
 MIN_REACH_HEIGHTS = 5.0
+MAX_TURN_DEG = 10.0
 
 
 def seen_up(facts: GroundFacts) -> Floats | None:
@@ -110,4 +111,4 @@ class _Plane(NamedTuple):
         """Whether another pair shows the same plane."""
         turn = float(self.up @ other.up)
         change = abs(self.height - other.height) / max(self.height, other.height)
-        return turn >= math.cos(math.radians(10.0)) and change <= 0.25
+        return turn >= math.cos(math.radians(MAX_TURN_DEG)) and change <= 0.25

@@ -72,6 +72,20 @@ def test_opencv_projections_alone_are_those_of_rectified_images(tmp_path):
     assert not lenses
 
 
+@pytest.mark.parametrize("flags", [0, cv2.CALIB_ZERO_DISPARITY])
+def test_opencv_q_alone_is_that_of_rectified_images(tmp_path, flags):
+    unlike = np.array([[400.0, 0, 260.0], [0, 400, 170], [0, 0, 1]])
+    given = P1[:, :3], np.zeros(5), unlike, np.zeros(5), (480, 360), ROTATION, SHIFT.reshape(3, 1)
+    _, _, first, second, Q, *_ = cv2.stereoRectify(*given, flags=flags)
+    storage = cv2.FileStorage(str(tmp_path / "q.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("Q", Q)
+    storage.release()
+    rig, _ = rig_of(*read_cameras(tmp_path / "q.yml"), ((480, 360), (480, 360)))
+    for camera, P in ((rig.left, first), (rig.right, second)):
+        np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (P[0, 0], P[1, 1], P[0, 2], P[1, 2]))
+    np.testing.assert_allclose(rig.T_right_left.translation, [-np.linalg.norm(SHIFT), 0, 0], atol=1e-9)
+
+
 def test_opencv_projections_stand_in_extrinsics_beside_intrinsics(tmp_path):
     for file, entries in (
         (

@@ -92,6 +92,44 @@ def test_swapped_folders_fail(tmp_path, capsys):
     assert "swapped" in line(lines, "sides")
 
 
+@pytest.mark.parametrize(
+    ("side", "axis", "words"),
+    [
+        ("left", 1, "once the left one is mirrored left to right:"),
+        ("right", 1, "once the right one is mirrored left to right:"),
+        # parallel cameras: either may be the wrong one
+        ("right", 0, "the left one is mirrored top to bottom or the right one is mirrored top to bottom:"),
+    ],
+)
+def test_one_camera_that_is_mirrored_is_named(tmp_path, capsys, side, axis, words):
+    path = folder(tmp_path / "wall", frames=1)
+    image = path / side / "000.png"
+    cv2.imwrite(str(image), np.flip(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE), axis))
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert next(text for text in lines if "RIL-676" in text).startswith("FAIL")
+    assert any(words in text for text in lines)
+
+
+def test_rows_of_one_grey_value_in_one_camera_are_named_and_a_sky_is_not(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=2)
+
+    def clear(side, rows):
+        for name in (path / side).iterdir():
+            image = cv2.imread(str(name), cv2.IMREAD_GRAYSCALE)
+            image[rows] = 180
+            cv2.imwrite(str(name), image)
+
+    for side in ("left", "right"):
+        clear(side, slice(0, 30))
+    assert not any("grey value" in text for text in run(path, capsys)[1])
+    clear("right", slice(90, None))
+    _, lines = run(path, capsys)
+    assert any(
+        "WARN" in text and "2 of 2 right images show one grey value in 50% of their rows" in text for text in lines
+    )
+
+
 def test_rows_that_are_off_are_measured(tmp_path, capsys):
     code, lines = run(folder(tmp_path / "wall", rows=3.0), capsys)
     assert code == 0

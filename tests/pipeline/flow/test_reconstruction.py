@@ -20,6 +20,7 @@ from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
 FRAMES = 8
+ASKS_NOTHING = {"asks": {"bridges": [], "sides": []}}
 
 WALL: Any = {"no_ground": "a wall", "plane": None}
 GROUND: Any = {
@@ -46,10 +47,9 @@ def lay_out(
     sequence = open_sequence("mockup-short", {"mockup": {"frames": FRAMES}})
     graph, settings = Graph(), config.build(config.expand(sequence.defaults), given)
     products, _ = dataflow(graph, sequence, settings, tuple(range(FRAMES)))
-    nothing = {"asks": {"bridges": [], "sides": []}}
     steps = len(answer["chain"]) - 1
     found = chosen | {"displacement": [1.0] * steps, "match_rate": [1.0] * steps}
-    for meta in [*({"asks": asks} for asks in asked), nothing | answer, found]:
+    for meta in [*({"asks": asks} for asks in asked), ASKS_NOTHING | answer, found]:
         deciding = [w for w in graph.expansions if w[0][0].stage in ("frame_screening", "keyframes")]
         deciding[-1][1](SimpleNamespace(meta=meta))
     for stage, meta in doubts or [("rig", {})]:
@@ -233,7 +233,8 @@ POSED = {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [
 def test_a_pair_of_two_moments_is_no_basic_pair() -> None:
     again = {"basic": [0, 2, 5, 6], "segments": [[0, 1, 2], [2, 3, 4, 5], [5, 6], [6, 7]]}
     exchanged = ("synchrony", {"partners": [[3, 4]], "contradiction": "left 3 with right 4"})
-    doubts = [("rig", {"suspects": [3]}), exchanged, ("keyframes", again), ("rig", {})]
+    as_before = ("frame_screening", ASKS_NOTHING | WHOLE)
+    doubts = [("rig", {"suspects": [3]}), exchanged, as_before, ("keyframes", again), ("rig", {})]
     graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
     assert products.keyframes is not None
     assert products.keyframes.spec.args["unfit"] == [3]
@@ -249,10 +250,59 @@ def test_where_most_pairs_contradict_their_rig_nothing_is_measured(late: bool) -
     line = {"contradiction": "left i with right i+1"}
     rig = {"suspects": [0, 3, 5, 6]} | ({} if late else line)
     found = ("synchrony", {"partners": [[k, k + 1] for k in (0, 3, 5)] if late else []} | (line if late else {}))
-    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=[("rig", rig), found])
+    as_before = [("frame_screening", ASKS_NOTHING | WHOLE)] if late else []
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=[("rig", rig), found, *as_before])
     assert products.trajectory is None
     assert bool(products.rigs) != late
     assert labels(graph, "resect") == labels(graph, "locus") == []
+
+
+def test_behind_an_image_that_one_camera_lost_all_frames_are_lost_and_those_before_are_kept() -> None:
+    """Most basic pairs are wrong: the others go on, and the rig that the wrong ones showed is of no account."""
+    late = {"chain": [0, 1, 2], "lost": [{"frame": k, "cause": "late"} for k in range(3, 8)], "unfit": []}
+    doubts = [
+        ("rig", {"suspects": [3, 5, 6]}),
+        ("synchrony", {"partners": [[5, 4], [6, 5]], "contradiction": "left 5 with right 4"}),
+        ("frame_screening", ASKS_NOTHING | late | {"late": [3, 4, 5, 6, 7]}),
+        ("keyframes", {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0] * 2, "match_rate": [1.0] * 2}),
+        ("rig", {}),
+    ]
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert len(labels(graph, "swap_check")) == FRAMES
+    assert products.trajectory is not None
+    assert products.trajectory.spec.args["lost"] == late["lost"]
+    assert [h.label for h in products.contradictions] == ["synchrony/lost/5", "intrinsics"]
+    assert products.contradictions[0].spec.args["pairs"] == [3, 4, 5, 6, 7]
+    assert {h.label for h in graph.nodes if h.index in graph.outdated} == {"rig", "synchrony"}
+
+
+@pytest.mark.parametrize("few", [True, False], ids=["few matches", "bad rows"])
+def test_one_pair_that_does_not_fit_the_rig_of_its_neighbours_is_lost_and_bridged(few: bool) -> None:
+    """A torn image, or one of another scene or time, in one camera."""
+    judged = {"per_pair": [{"pair": k} for k in (0, 5, 6)]} if few else {"suspects": [3]}
+    if not few:
+        judged["per_pair"] = [{"pair": k} for k in (0, 3, 5, 6)]
+    again: dict[str, Any] = {"basic": [0, 2, 5], "segments": [[0, 1, 2], [2, 3, 4, 5], [5, 6]]}
+    doubts = [
+        ("rig", judged),
+        *([] if few else [("synchrony", {"partners": []})]),
+        ("keyframes", again | {"displacement": [1.0] * 6, "match_rate": [1.0] * 6}),
+        ("rig", {"per_pair": [{"pair": k} for k in (0, 2, 6)]}),
+    ]
+    graph, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert products.trajectory is not None
+    (lost,) = products.trajectory.spec.args["lost"]
+    assert lost["frame"] == 3
+    assert "do not fit each other" in lost["cause"]
+    assert list(products.world_dem) == [0, 2, 6]
+    assert "motion/2-4" in labels(graph, "motion")
+    assert "rig" in {h.label for h in graph.nodes if h.index in graph.outdated}
+
+
+def test_two_pairs_in_a_row_that_do_not_fit_may_be_a_rig_that_moved() -> None:
+    doubts: list[tuple[str, dict[str, Any]]] = [("rig", {"per_pair": [{"pair": 0}, {"pair": 6}]})]
+    _, products = lay_out([], WHOLE, CHOICE, POSED, doubts=doubts)
+    assert list(products.world_dem) == [0, 3, 5, 6]
 
 
 def test_rows_that_no_other_moment_explains_change_nothing() -> None:

@@ -80,3 +80,18 @@ def test_few_matches_that_hardly_move_are_no_partner():
     """Far away in time only the horizon matches, which fits all rows."""
     found = best_partners({0: {0: offsets(3.0), 1: offsets(0.3), 8: offsets(0.1, 45)}})
     assert found["partners"] == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("shift", "anew"),
+    [(-1, "1 to the numbers of the right images from 4 on"), (2, "2 to the numbers of the left images from 5 on")],
+)
+def test_behind_an_image_that_one_camera_lost_the_numbers_that_fit_are_told(shift, anew):
+    """The first pair behind it has no partner."""
+    late = {pair: {pair + k: offsets(0.3 if k == shift else 5.0) for k in (-1, 0, 2)} for pair in range(5, 9)}
+    fine = {pair: {pair + k: offsets(5.0 if k else 0.3) for k in (-1, 0, 2)} for pair in range(4)}
+    found = best_partners(fine | late)
+    assert [pair for pair, _ in found["partners"]] == [5, 6, 7, 8]
+    assert found["contradiction"].endswith(f"add {anew}")
+    # of two pairs alone one does not know
+    assert "add" not in best_partners(fine | {pair: late[pair] for pair in (5, 6)})["contradiction"]

@@ -55,6 +55,16 @@ def test_rates_in_degrees_of_a_camera_at_rest_are_named():
     assert "exchange" not in line
 
 
+def test_an_attitude_that_begins_anew_behind_each_gap_hides_nothing():
+    rates = turning(1.0, 2)
+    sensed = attitudes(rates[:, [2, 1, 0]])
+    for gap in range(2, len(TIMES), 3):
+        sensed[gap] = np.nan
+        sensed[gap + 1 :] = Rotation.from_rotvec([0.3, -0.5, 1.3]).as_matrix() @ sensed[gap + 1 :]
+    (line,) = of_rotations(noisy(attitudes(rates)), sensed, TIMES, AXES)
+    assert "its z, y, x:" in line
+
+
 @pytest.mark.parametrize("speed", [0.0, 0.02, 0.3, 2.0])
 def test_a_right_sensor_never_contradicts_not_even_with_its_bias(speed):
     for seed in range(5):

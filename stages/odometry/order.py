@@ -1,0 +1,34 @@
+"""Whether frames stand in another order than they were taken: a camera that jumps, where another order has no jump."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rille.stages.core.arrays import Floats
+
+JUMP = 3.0
+"""Median steps from one frame to the next, from which on a step is a jump; half of it joins two frames."""
+
+
+def without_jumps(places: Floats) -> list[tuple[int, int]]:
+    """First and last row, of places (n, 3), of the runs of rows that follow each other without a jump, in that order.
+
+    A run whose first row is behind its last one is taken backwards. Empty where there are fewer than two jumps, which a
+    camera that comes back may make, or where another order has jumps, too. The first run stays the first.
+    """
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    jump = JUMP * float(np.median(steps)) if steps.size else 0.0
+    ends = np.flatnonzero(steps > jump)
+    if not 2 <= len(ends) <= len(places) // 3:
+        return []
+    first, *left = list(zip([0, *(ends + 1).tolist()], [*ends.tolist(), len(places) - 1], strict=True))
+    path = [first]
+    while left:
+        either = [*left, *((b, a) for a, b in left)]
+        away = np.linalg.norm(places[[a for a, _ in either]] - places[path[-1][1]], axis=1)
+        k = int(np.argmin(away))
+        if away[k] > 0.5 * jump:
+            return []
+        path.append(either[k])
+        left.pop(k % len(left))
+    return path
