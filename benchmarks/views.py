@@ -7,7 +7,7 @@ truth is the rendered depth, exact. Photographs (``motorcycle``, ``cones``, ``mi
 turned and scaled by bicubic interpolation; the truth is the disparity moved alike, which is given to a quarter or a
 third of a pixel, motorcycle's to about a tenth. Columns: share of the left image that the right one sees (photographs:
 that falls into it, what is hidden there included); of those pixels, matched, matched within 1 px (of the vector), and
-filled within 1 px; median error of the matched ones. The limits of ``stages/hfvm/viewpoint.py`` were chosen on
+filled within 1 px; median error of the matched ones. The limits of ``stages/hfvm/plane.py`` were chosen on
 the Moon's views and on turned copies of one street image; photographs judge.
 """
 

@@ -77,7 +77,7 @@ NOTHING: Mapping[str, Any] = dict.fromkeys(Merged._fields, np.float32(np.nan)) |
 
 
 def merge_cells(
-    maps: Floats32, layers: Sequence[ModelLayer], strip: Lattice, errors: CommonErrors, worst: float
+    maps: Floats32, layers: Sequence[ModelLayer], strip: Lattice, errors: SharedErrors, worst: float
 ) -> dict[str, Any]:
     """Maps (rows, cols) of :class:`Merged` by name; weights and equations are those of the module.
 
@@ -208,7 +208,7 @@ class Placed:
 EXACT = Placed(np.zeros(3), np.zeros((3, 3)))
 
 
-class CommonErrors(NamedTuple):
+class SharedErrors(NamedTuple):
     """Errors that models share: ``alike``, correlation of two at one cell; ``inverse_depth_std``, 1/m, of a rig."""
 
     alike: float
@@ -264,7 +264,7 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams, inve
     ordered = sorted(layers, key=lambda layer: layer.pair)
     assert len({layer.pair for layer in ordered}) == len(ordered)
     ordered = [layer for layer in ordered if tile.intersection(layer.lattice) is not None]
-    errors = CommonErrors(params.alike, inverse_depth_std)
+    errors = SharedErrors(params.alike, inverse_depth_std)
     out = {name: np.full(tile.shape, none) for name, none in NOTHING.items()}
     worst = math.inf if params.max_std_cells is None else params.max_std_cells * tile.cell
     # Some sixteen numbers of eight bytes a cell and model.
