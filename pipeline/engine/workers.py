@@ -447,6 +447,9 @@ class Dask:
             if self._ours:
                 _leave(self._client, within)
             return
+        until = time.monotonic() + LEAVE_SECONDS
+        while kill and self._beginning() and time.monotonic() < until:
+            time.sleep(0.01)
         processes = [nanny.pid for nanny in self._nannies if nanny.pid]
         if kill:
             for nanny in self._nannies:
@@ -458,6 +461,11 @@ class Dask:
         self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
         _kill(processes)
         take_back()
+
+    def _beginning(self) -> bool:
+        """Whether a worker of our own that is to start has no number yet by which it could be killed."""
+        begun = [nanny for nanny in self._nannies if nanny.pid or nanny.status.name == "closed"]
+        return len(begun) < max(len(self._nannies), len(self._cluster.worker_spec))
 
 
 Workers = Inline | Dask
