@@ -74,6 +74,12 @@ def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
                 error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED_PX)
 
 
+def nearest(a: AnyArray, there: Map) -> AnyArray:
+    """Values (row, col) of ``a`` at the pixels nearest to where displacements lead; of its border beyond it."""
+    y, x = np.indices(there.u.shape, np.float32)
+    return cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
 @njit(cache=True, nogil=True)
 def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
     """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
@@ -237,7 +243,8 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     how = 1 if work.alignment is None else 2, work.upright
     u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
     removed = work.images.left.noise**2, work.images.right.noise**2
-    alike, variance = refinement.surroundings(rest, work.a.deviation, keep, removed)
+    deviations = work.a.deviation, nearest(work.b.deviation, Map(u, v))
+    alike, variance = refinement.surroundings(rest, deviations, keep, removed)
     # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
     noise = per_noise * (variance * np.float32(9) if any(removed) else variance)
     validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)

@@ -270,41 +270,50 @@ def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
         out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
 
 
-def surroundings(rest: AnyArray, deviation: AnyArray, keep: AnyArray, noise: tuple[float, float]) -> Maps:
+def surroundings(rest: AnyArray, deviations: Maps, keep: AnyArray, noise: tuple[float, float]) -> Maps:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
     Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
-    left image's local ``deviation``: two signals of equal variance s^2 and correlation r differ by 2 s^2 (1 - r).
-    Noise that found noise to match, in a shadow or the sky, gives itself away. ``noise``: variances that the left and
-    the right image's noise had before they were denoised. What the noise explains of s^2 and of the difference is then
-    left out, if that makes them more alike and the left image shows more than noise.
+    local ``deviations`` of the left image and, at its matches, the right one: signals of deviations a and b and
+    correlation r differ by a^2 + b^2 - 2 r a b. Noise that found noise to match, in a shadow or the sky, gives itself
+    away. ``noise``: variances that the left and the right image's noise had before they were denoised. What the noise
+    explains of a^2, b^2 and of the difference is then left out, if that makes them more alike and the left image shows
+    more than noise.
     """
     known = keep & (rest < np.inf)
     nil = np.float32(0.0)
-    planes = np.where(known, rest, nil), np.where(known, deviation * deviation, nil), known.astype(np.float32)
+    planes = (*(np.where(known, a, nil) for a in (rest, *(d * d for d in deviations))), known.astype(np.float32))
     # Fewer pixels do not tell correlated noise from texture.
     sums = tuple(window_sum32(plane, 9) for plane in planes)
     correlation, around = np.empty_like(rest), np.empty_like(rest)
-    _correlation(sums, (np.float32(noise[0]), np.float32(noise[0] + noise[1])), correlation, around)
+    _correlation(sums, (np.float32(noise[0]), np.float32(noise[1])), correlation, around)
     return correlation, around
 
 
 @njit(cache=True, nogil=True)
 def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-def]
-    one, two, least, nil = np.float32(1.0), np.float32(2.0), np.float32(1e-6), np.float32(0.0)
-    own, both = noise
+    nil, one = np.float32(0.0), np.float32(1.0)
     # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
     # noise alone, of which denoising leaves about .3.
     texture = np.float32(0.4 * 0.4)
     for y in range(correlation.shape[0]):
-        differ, power, count = sums[0][y], sums[1][y], sums[2][y]
+        differ, left, right, count = sums[0][y], sums[1][y], sums[2][y], sums[3][y]
         for x in range(correlation.shape[1]):
-            with_noise = one - differ[x] / max(two * power[x], least)
-            difference, signal = max(differ[x] - both * count[x], nil), power[x] - own * count[x]
-            textured = power[x] > texture * own * count[x]
-            without = one - difference / max(two * signal, least) if textured else with_noise
-            correlation[y, x] = max(with_noise, without) if power[x] > 0 else one
-            around[y, x] = differ[x] / max(count[x], one)
+            n, a, b = count[x], left[x], right[x]
+            found = _alike(differ[x], a, b)
+            if a > texture * noise[0] * n:
+                rest = max(differ[x] - (noise[0] + noise[1]) * n, nil)
+                found = max(found, _alike(rest, a - noise[0] * n, b - noise[1] * n))
+            correlation[y, x] = found if a > 0 else one
+            around[y, x] = differ[x] / max(n, one)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _alike(differ, a, b):  # type: ignore[no-untyped-def]
+    """Correlation of signals of the variances ``a, b`` whose difference has the variance ``differ``."""
+    least = np.float32(1e-6)
+    a, b = max(a, least), max(b, least)
+    return (a + b - differ) / (np.float32(2.0) * np.sqrt(a * b))
 
 
 BEND_STIFFNESS = 2000.0

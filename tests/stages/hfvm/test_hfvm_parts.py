@@ -252,6 +252,17 @@ def refined(left, right, start, keep, steps=1):
     return refinement.refine(images, lambda u, v: (u, v), start, keep, steps)
 
 
+def variance(image):
+    mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
+    return (mean(image * image) - mean(image) ** 2).astype(np.float32)
+
+
+def correlation(left, right, noise=(0.0, 0.0)):
+    """What the refinement says of images of one size that lie upon each other, but for their borders."""
+    keep, deviations = np.ones(left.shape, bool), (np.sqrt(variance(left)), np.sqrt(variance(right)))
+    return refinement.surroundings(variance(left - right), deviations, keep, noise)[0][8:-8, 8:-8]
+
+
 class TestRefine:
     def test_recovers_sub_pixel_displacements_to_the_noise_limit(self):
         noise, window = 1.0, 5
@@ -277,40 +288,38 @@ class TestRefine:
     def test_correlation_tells_noise_from_texture(self):
         rng = np.random.default_rng(0)
         signal, a, b = rng.normal(0, 10, (3, 60, 60))
-        keep = np.ones((60, 60), bool)
-        mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
-        variance = lambda z: (mean(z * z) - mean(z) ** 2).astype(np.float32)  # noqa: E731
-        found = [
-            refinement.surroundings(variance(d), np.sqrt(variance(s)), keep, (0.0, 0.0))
-            for d, s in ((0.1 * a - 0.1 * b, signal + 0.1 * a), (a - b, a))
-        ]
-        (same, _), (none, around) = found
-        assert same.min() > 0.9
+        cases = {
+            "alike": (signal + 0.1 * a, signal + 0.1 * b),
+            "of other contrast": (signal + 0.1 * a, 2.5 * signal + 0.1 * b),
+            "faint noise": (a, 0.4 * b),
+            "noise": (a, b),
+        }
+        found = {name: correlation(*images) for name, images in cases.items()}
+        assert found["alike"].min() > 0.9
+        assert found["of other contrast"].min() > 0.9
         # 81 overlapping windows of 25 noise values each: the deviation of a correlation is about a tenth.
-        assert np.abs(none[8:-8, 8:-8]).max() < 0.5
+        assert np.abs(found["faint noise"]).max() < 0.5
+        assert np.abs(found["noise"]).max() < 0.5
+
+    def test_residuals_are_those_around(self):
+        a, b = np.random.default_rng(0).normal(0, 10, (2, 60, 60))
+        keep, deviations = np.ones((60, 60), bool), (np.sqrt(variance(a)), np.sqrt(variance(b)))
+        _, around = refinement.surroundings(variance(a - b), deviations, keep, (0.0, 0.0))
         assert around[30, 30] == pytest.approx(variance(a - b)[26:35, 26:35].mean(), rel=1e-4)
 
     def test_correlation_leaves_out_the_noise_that_it_is_told(self):
         rng = np.random.default_rng(1)
         signal, other, noise = rng.normal(0, 1, (3, 60, 60))
-        keep = np.ones((60, 60), bool)
-        mean = lambda z: ndimage.uniform_filter(z, 5)  # noqa: E731
-        variance = lambda z: (mean(z * z) - mean(z) ** 2).astype(np.float32)  # noqa: E731
-        inner = np.s_[8:-8, 8:-8]
         # The right image's noise is as strong as what both show, or stronger by half.
-        for difference, told, low, high in (
-            (noise, 0.0, 0.3, 0.7),
-            (noise, 1.0, 0.8, 1.0),
-            (signal - other, 0.0, -0.3, 0.3),
-            (signal - other + 1.5 * noise, 1.5**2, -0.5, 0.5),
+        for right, told, low, high in (
+            (signal + noise, 0.0, 0.6, 0.8),
+            (signal + noise, 1.0, 0.8, 1.1),
+            (other, 0.0, -0.3, 0.3),
+            (other + 1.5 * noise, 1.5**2, -0.5, 0.5),
         ):
-            found, _ = refinement.surroundings(variance(difference), np.sqrt(variance(signal)), keep, (0.0, told))
-            assert low < found[inner].mean() < high
-        # Noise of the left image is in its deviation, too: what is left of it is the texture's.
-        found, _ = refinement.surroundings(
-            variance(signal - other), np.sqrt(variance(signal + noise)), keep, (1.0, 0.0)
-        )
-        assert abs(found[inner].mean() - 0.5) < 0.2
+            assert low < correlation(signal, right, (0.0, told)).mean() < high
+        # Noise of the left image is in its deviation, too.
+        assert abs(correlation(signal + noise, signal, (1.0, 0.0)).mean() - 1) < 0.2
 
 
 def test_local_mean_takes_only_like_neighbours():
