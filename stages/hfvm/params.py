@@ -131,11 +131,11 @@ class HfvmParams(Params):
         "is about the widest occlusion of a close stereo rig",
     )
     correlation: float = Field(
-        default=0.5,
+        default=0.6,
         ge=-1,
         le=1,
         description="least correlation of both images' windows after refinement; larger: fewer matches, fewer "
-        "errors; smaller: noise may match noise, whose correlations scatter by a tenth around 0",
+        "errors; below the default, noise matched noise",
     )
     min_support: float = Field(
         default=0.0,
