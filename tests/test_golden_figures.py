@@ -17,14 +17,14 @@ SIMULATED = {
     "trajectory_final_error": 2.88e-5,  # metres
     "disparity_median": 0.1245,  # pixels
     "disparity_completeness": 0.829,
-    "disparity_bad_2": 0.1102,
+    "disparity_bad_2": 0.1112,
     "disparity_bad_2_matched": 0.0142,
     "disparity_within_1_sigma": 0.756,
-    "dem_merged_rmse": 5.98e-4,  # metres
-    "dem_merged_completeness": 0.825,
-    "hazardous": 0.1586,
-    "unknown": 0.496,
-    "path_length": 0.253,  # metres
+    "dem_merged_rmse": 5.66e-4,  # metres
+    "dem_merged_completeness": 0.806,
+    "hazardous": 0.1508,
+    "unknown": 0.5075,
+    "path_length": 0.2497,  # metres
 }
 
 REAL = {
