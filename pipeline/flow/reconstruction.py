@@ -155,14 +155,13 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
         found = yield from simultaneous(make, frames, whole, screening)
-        chain, chosen = found.chain, found.keyframes
-        if chosen is None:
+        if found.choice is None:
             return
+        chain, chosen, basic = found.chain, found.choice.keyframes, found.choice.basic
         # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
         lost = sorted([*missing, *found.lost], key=lambda item: item["frame"])
-        basic = [chain[i] for i in chosen.meta["basic"]]
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, found.rigs)
+        matched = yield from matched_pairs(make, found.choice.rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
@@ -278,20 +277,80 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
 
 
 @dataclass(frozen=True)
+class Choice:
+    """Basic pairs, the rig of each, and the facts of these rigs; ``suspects`` are pairs of doubtful rows, and ``which``
+    ends the labels of its tasks."""
+
+    which: str
+    keyframes: Ref[KeyframesFacts]
+    basic: list[int]
+    rigs: dict[int, Handle[CalibrationFacts]]
+    judged: list[Ref[RigFacts]]
+    suspects: list[int]
+
+
+def basic_pairs(
+    make: Builder, chain: list[int], unfit: set[int], behind: list[int], mode: str
+) -> Generator[Wait, Any, Choice]:
+    """Choose basic pairs of a ``chain`` of frames, and find their rigs: one for all pairs, or one each (``mode``).
+
+    No ``unfit`` frame is basic; ``behind`` are places in the chain behind a frame that has no pose.
+    """
+    p = make.products
+    # Each contradiction leads to another choice.
+    which = f"/{len(p.contradictions)}" if p.contradictions else ""
+    p.keyframes = make.node(
+        keyframes_stage,
+        f"keyframes{which}",
+        steps=steps(make, chain),
+        frames=len(chain),
+        unfit=[k for k, f in enumerate(chain) if f in unfit] or None,
+        behind=behind or None,
+    )
+    yield Complete(("motion", "step_table"))
+    chosen = yield from done(p.keyframes)
+    basic = [chain[i] for i in chosen.meta["basic"]]
+    pooled = mode != "per_pair" and make.rig(representative(basic), which)
+    rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
+    p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
+    judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
+    suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
+    return Choice(which, chosen, basic, known, judged, suspects)
+
+
+def of_other_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
+    """Compare pairs of doubtful rows with right images of other times; and ask whether what they show repeats."""
+    # 12: pairs that are compared at once.
+    shown = spread(choice.suspects, 12)
+    asked = make.synchrony(f"synchrony{choice.which}", shown, chain)
+    make.products.contradictions += [asked, make.repetition(f"repetition{choice.which}", shown)]
+    return (yield from done(asked))
+
+
+def misfits(choice: Choice, mode: str) -> set[int]:
+    """Pairs that do not fit the rig as their neighbours do; none where many pairs do not: these bend the rig itself."""
+    basic, facts = choice.basic, [rig.meta.get("per_pair", ()) for rig in choice.judged]
+    fitting = {one["pair"] for pairs in facts for one in pairs}.difference(choice.suspects)
+    bad = set(basic if mode == "per_pair" else representative(basic)) - fitting
+    # A rig that moved did so for the next pairs, too.
+    alone = {b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}}
+    return alone if 4 * len(bad) <= len(basic) else set()
+
+
+@dataclass(frozen=True)
 class Simultaneous:
-    """Frames of the ``chain``, those that are ``lost`` (frame and cause), basic pairs, None where nothing can be
-    measured, and the rig of each."""
+    """Frames of the ``chain``, those that are ``lost`` (frame and cause), and the choice of basic pairs, None where
+    nothing can be measured."""
 
     chain: list[int]
     lost: list[dict[str, Any]]
-    keyframes: Ref[KeyframesFacts] | None
-    rigs: dict[int, Handle[CalibrationFacts]]
+    choice: Choice | None
 
 
 def simultaneous(
     make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
 ) -> Generator[Wait, Any, Simultaneous]:
-    """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
+    """Choose basic pairs; while their rigs or images contradict each other, lose what does so and choose again.
 
     Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
     not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
@@ -306,64 +365,40 @@ def simultaneous(
         late = found.meta.get("late", [])
         if late and not p.contradictions:
             p.contradictions.append(lost_by_time(make, late, whole))
-        # Each contradiction leads to another choice.
-        which = f"/{len(p.contradictions)}" if p.contradictions else ""
-        p.keyframes = make.node(
-            keyframes_stage,
-            f"keyframes{which}",
-            steps=steps(make, chain),
-            frames=len(chain),
-            unfit=[k for k, f in enumerate(chain) if f in wrong or f in found.meta["unfit"]] or None,
-            behind=behind or None,
-        )
-        yield Complete(("motion", "step_table"))
-        chosen = yield from done(p.keyframes)
-        basic = [chain[i] for i in chosen.meta["basic"]]
-        # The rig's time grows with the pairs; of 200 its errors are systematic.
-        pooled = mode != "per_pair" and make.rig(spread(basic, 200), which)
-        rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
-        p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
-        judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
-        suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
-        if suspects:
-            # 12: pairs of doubtful rows that are compared with right images of other times at once.
-            shown = spread(suspects, 12)
-            asked = make.synchrony(f"synchrony{which}", shown, chain)
-            p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
-            apart = yield from done(asked)
+        choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
+        if choice.suspects:
+            apart = yield from of_other_times(make, choice, chain)
             partners = apart.meta["partners"]
             if partners and not timed:
                 # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
                 timed = True
                 again = yield from screened(make, whole, timed)
                 if again.meta["lost"] != found.meta["lost"]:
-                    make.graph.outdated |= {one.index for one in (asked, *p.rigs.values())}
+                    make.graph.outdated |= {one.index for one in (*p.contradictions, *p.rigs.values())}
                     found = again
                     p.contradictions.clear()
                     continue
-            contradicted = any("contradiction" in one.meta for one in (apart, *judged))
-            if contradicted and 2 * len(suspects) > len(basic):
+            contradicted = any("contradiction" in one.meta for one in (apart, *choice.judged))
+            if contradicted and 2 * len(choice.suspects) > len(choice.basic):
                 # A rig that images of two times show is none: a camera that moves in it did not.
                 p.rigs = {} if partners else p.rigs
                 if late and partners:
                     p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
-                return Simultaneous(chain, lost, None, {})
+                return Simultaneous(chain, lost, None)
             if partners:
                 wrong |= {pair for pair, _ in partners}
                 continue
-        fitting = {one["pair"] for rig in judged for one in rig.meta.get("per_pair", ())}.difference(suspects)
-        bad = set(spread(basic, 200) if pooled else basic) - fitting
-        # A rig that moved did so for the next pairs, too; one that images of two times or many pairs bend judges none.
-        alone = [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]
-        if alone and not late and 4 * len(bad) <= len(basic):
+        # A rig that images of two times bend judges no pair.
+        alone = set[int]() if late else misfits(choice, mode)
+        if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= set(alone)
-            continue
-        if not any("knocked" in one.meta for one in judged):
-            return Simultaneous(chain, lost, chosen, known)
-        p.contradictions.append(p.rigs[basic[0]])
-        # One calibration does not describe this rig: each pair has its own.
-        mode = "per_pair"
+            odd |= alone
+        elif any("knocked" in one.meta for one in choice.judged):
+            p.contradictions.append(p.rigs[choice.basic[0]])
+            # One calibration does not describe this rig: each pair has its own.
+            mode = "per_pair"
+        else:
+            return Simultaneous(chain, lost, choice)
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
@@ -589,6 +624,11 @@ def cells_in_both(a: Series[int], b: Series[int]) -> int:
     """Cells that two boxes (first column, first line, columns, lines) have in common."""
     columns, lines = (min(a[k] + a[k + 2], b[k] + b[k + 2]) - max(a[k], b[k]) for k in (0, 1))
     return max(columns, 0) * max(lines, 0)
+
+
+def representative(basic: list[int]) -> list[int]:
+    """Pairs by which one rig is found for all: its time grows with the pairs; of 200 its errors are systematic."""
+    return spread(basic, 200)
 
 
 def spread(items: list[Any], most: int) -> list[Any]:
