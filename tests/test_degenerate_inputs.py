@@ -40,6 +40,7 @@ RUNS = {
 }
 ELSEWHERE = {
     *(
+        "calibration.mirror_check",
         "calibration.repetition",
         "calibration.swap_check",
         "calibration.synchrony",

@@ -387,6 +387,15 @@ def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given
     return judge("matching", text, figures)
 
 
+def judge_mirror(fitting: Mapping[str, float]) -> Finding | None:
+    """Which image is mirrored: those that make most matches fit once they are, and the share of these."""
+    if not fitting:
+        return None
+    share, which = max(fitting.values()), " or ".join(fitting)
+    text = f"{share:.0%} of the matches of the first pair's images fit the rig once {which}"
+    return judge("images", text, {"mirrored": len(fitting)})
+
+
 def judge_sides(beyond: float) -> Finding:
     """Share of the matches that lie beyond infinity under the given rig."""
     return judge("sides", f"{100 * beyond:.1f} % of the matches lie beyond infinity", {"beyond": beyond})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,8 @@ from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.runs.session import settings
-from rille.stages.calibration.relative_orientation import MIN_MATCHES
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
-from rille.stages.geometry.sides import fits
-from rille.stages.imaging.features import extract, matched_points
 from rille.stages.imaging.image_quality import glance
 
 Steps = Generator[Wait, Any, None]
@@ -181,7 +178,8 @@ class Inspection:
         matching = judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given)
         self.say(matching)
         if matching.level == "FAIL":
-            yield from self._mirrored(pair)
+            mirror = yield self.make.mirrored(pair)
+            self.say(judge.judge_mirror(mirror.meta["fitting"]))
         if len(left):
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
@@ -199,23 +197,6 @@ class Inspection:
             last = max((pair for pair in chosen if pair < first), default=first)
             between = [k for k in whole if last < k < first]
         self.say(judge.judge_synchrony(rows.meta))
-
-    def _mirrored(self, pair: int) -> Steps:
-        """Whether the images of a pair fit the rig once one of them is mirrored."""
-        opened = [self.store.open(ref) for ref in (yield [self.make.image(pair, camera) for camera in CAMERAS])]
-        arrays = {c: [np.asarray(o[name]) for name in ("image", "valid")] for c, o in zip(CAMERAS, opened, strict=True)}
-        features, shares = {camera: extract(*of) for camera, of in arrays.items()}, dict[tuple[str, str], float]()
-        # Features match whichever way an image is turned: the rig tells which way is right.
-        for (camera, of), (axis, way) in product(arrays.items(), enumerate(("top to bottom", "left to right"))):
-            mirrored = extract(*(np.ascontiguousarray(np.flip(a, axis)) for a in of))
-            points = matched_points(*(features | {camera: mirrored}).values())
-            shares[camera, way] = fits(self.sequence.rig, *points) if len(points[0]) >= MIN_MATCHES else 0.0
-        fitting = {(camera, way): share for (camera, way), share in shares.items() if share > 0.5}
-        if fitting:
-            # Of parallel cameras both fit from top to bottom: then nothing tells which.
-            which = " or ".join(f"the {camera} one is mirrored {way}" for camera, way in fitting)
-            text = f"{max(fitting.values()):.0%} of the matches of the first pair's images fit the rig once {which}"
-            self.say(judge.judge("images", text, {"mirrored": len(fitting)}))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
