@@ -100,9 +100,6 @@ from rille.stages.terrain.tile_index import tile_index_stage
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
-SEAMS = 24
-"""Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
-
 
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
@@ -614,7 +611,8 @@ def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handl
                 shared[other] += cells_in_both(box, theirs)
             here.append((pair, box))
         if shared:
-            nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:SEAMS]
+            # 24: enough to tell which is off, however often a place is seen again.
+            nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:24]
             others = [models[other] for other in sorted(nearest)]
             seams[pair] = make.node(overlap_qa_stage, f"overlap_qa/{pair}", dem=models[pair], others=others)
     return seams

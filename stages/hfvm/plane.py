@@ -47,17 +47,12 @@ KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
 
-PLANE_TOLERANCE_PX = 1.0
-"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
-weight."""
-
-
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
     """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
 
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
-    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    fit = fit_points(sample, shapes[level])
     # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
     # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
     if fit is None or fit[1] < (0.5 if few else 0.6):
@@ -72,7 +67,7 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
 
 def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
     """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
-    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    fit = fit_points(sample, shapes[level])
     return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
 
 
@@ -157,13 +152,12 @@ def translation(x: float, y: float | None = None) -> Matrix:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, x if y is None else y], [0.0, 0.0, 1.0]])
 
 
-def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, float] | None:
-    """Homography of the dominant plane, and the share of matches within twice ``tolerance`` of it; None: too few.
+def fit_points(sample: Sample, shape: Shape) -> tuple[Matrix, float] | None:
+    """Homography of the dominant plane, and the share of matches within two pixels of it; None: too few.
 
     Parameters
     ----------
     sample : matches of one level, which has ``shape``.
-    tolerance : pixels; a match this far from the plane has a quarter of the weight.
 
     Returns
     -------
@@ -178,8 +172,9 @@ def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, 
     to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
     p = np.stack([x / scale - middle[0], y / scale - middle[1]])
     d = np.stack([u, v]).astype(np.float64) / scale
-    unit, error = _solve(p, d, tolerance / scale)
-    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tolerance / scale))
+    # A match a pixel of the level off the plane has a quarter of the weight.
+    unit, error = _solve(p, d, 1.0 / scale)
+    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2.0 / scale))
 
 
 def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray]:
@@ -265,9 +260,6 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
                 out_valid[y, x] = 1
 
 
-MAX_SIDE_PX = 1024
-"""Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
-
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
 
@@ -290,8 +282,8 @@ def find_turn(left: Image, right: Image) -> Matrix | None:
 
 
 def _level(view: Image) -> int:
-    """Finest level whose longer side is at most :data:`MAX_SIDE_PX`, else the coarsest."""
-    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= MAX_SIDE_PX), len(view.shapes) - 1)
+    """Finest level whose longer side is at most 1024 pixels, else the coarsest: keypoints are looked for there."""
+    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= 1024), len(view.shapes) - 1)
 
 
 def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -46,13 +46,13 @@ from rille.stages.terrain.ground import (
     view_matches,
 )
 from rille.stages.terrain.matches import Matches
+from rille.stages.terrain.points import MIN_DEPTH_SIGMAS
 
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
 
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
-BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
 MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the reference, though tilted beyond the limits
 
 
@@ -123,7 +123,7 @@ def level(
         "source": source,
         "plane": None,
         "relief": None,
-        "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * samples.sigma], rig),
+        "cell_size": _cell_without_ground(rho[rho > MIN_DEPTH_SIGMAS * samples.sigma], rig),
         "footprint": None,
         "ground_share": 0.0,
         "no_ground": str(why),
@@ -271,7 +271,7 @@ def sampled(matches: Matches, rig: Rig, sigma_px: float) -> Samples:
     sigma = per_pixel * sigma_px
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
-        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
+        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -MIN_DEPTH_SIGMAS * sigma)))
     return Samples(rig.left.rays(pixels), rho, sigma, sigma_px, coarser_focal(rig))
 
 
