@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.engine.store.zarr_group import CHUNK
 from rille.pipeline.export.view import Part, Reads, RunView
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, NoParams, Stage
 from rille.stages.core.errors import InputError
@@ -139,8 +138,8 @@ def pack(folder: Path) -> Bundle:
     # Sorted: file systems list a folder in any order, and equal files must make equal artifacts.
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     data = np.frombuffer(b"".join(files.values()), dtype=np.uint8)
-    # Rows as long as a chunk of an artifact.
-    blocks = np.zeros((-(-len(data) // CHUNK), CHUNK), dtype=np.uint8)
+    # Rows of 1024 bytes: a chunk of an artifact is 1024 x 1024 then.
+    blocks = np.zeros((-(-len(data) // 1024), 1024), dtype=np.uint8)
     blocks.reshape(-1)[: len(data)] = data
     return Bundle({"content": blocks}, {"files": [[name, len(content)] for name, content in files.items()]})
 
