@@ -22,11 +22,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.cubic import cubic
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Layer, Shape, Window
+from rille.stages.imaging.features import match, root_sift
 from rille.stages.imaging.pyramid import filled_from
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -267,8 +269,8 @@ MIN_AGREEING = 15
 def find_turn(left: Image, right: Image) -> Matrix | None:
     """Homography from left to right pixels (level 0) on which enough keypoints agree, or None."""
     levels = [_level(view) for view in (left, right)]
-    (p, a), (q, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
-    first, second = _alike(a, b)
+    (p, _, a), (q, _, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
+    first, second = match(a.astype(np.float32), b.astype(np.float32)).T
     if len(first) < MIN_AGREEING:
         return None
     # What relief does to a keypoint's place on the dominant surface.
@@ -286,31 +288,14 @@ def _level(view: Image) -> int:
     return next((n for n, shape in enumerate(view.shapes) if max(shape) <= 1024), len(view.shapes) - 1)
 
 
-def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
+def _keypoints(view: Image, level: int) -> tuple[Floats, Floats, Bytes]:
+    """Keypoints of a level: columns and rows, pixels of the level, sizes, and descriptors (:func:`root_sift`)."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
     # Comparing all keypoints with all takes their number squared.
     # 0.02: least contrast of a keypoint; half of OpenCV's default, for sand and haze.
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]  # not in the stubs
-    points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
-    if not points:
-        return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
-    total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
-    # Roots of shares have length one, and their Euclidean distance is Hellinger's between the histograms.
-    return np.array([point.pt for point in points], np.float32), np.sqrt(histograms / total)
-
-
-def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of descriptors (n, 128) of which each is the other's nearest, by far."""
-    if len(a) < 2 or len(b) < 2:
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = [m.trainIdx for (m,) in matcher.knnMatch(b, a, k=1)]
-    near = matcher.knnMatch(a, b, k=2)
-    # Lowe's (2004): the nearest keypoint is nearer by this factor than the second nearest.
-    kept = [m for m, n in near if m.distance < 0.8 * n.distance and back[m.trainIdx] == m.queryIdx]
-    return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
+    sift = cv2.SIFT.create(nfeatures=4000, contrastThreshold=0.02)
+    return root_sift(sift, grey, (layer.valid != 0).astype(np.uint8))
 
 
 def _upright(h: Matrix, shape: Shape) -> bool:
