@@ -99,7 +99,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     early = [p.screening, *p.contradictions, p.keyframes, p.intrinsics, *p.crosschecks, p.crosscheck, p.agreement]
     truths = (p.accuracy, p.position_accuracy, *p.disparity_accuracy.values())
-    for handle in (*early, p.trajectory, *truths, p.overlap_audit):
+    for handle in (*early, p.trajectory, *truths, p.overlap_audit, *p.ground.values()):
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))

@@ -17,6 +17,7 @@ import numpy as np
 from rille.datasets.protocol import Positions, Rows
 from rille.datasets.text.count import count
 from rille.stages.core.arrays import Floats
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between, lengths_along
@@ -125,6 +126,7 @@ LIMITS = {
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
+    "ground": (InputLimit("RIL-679", "above", most=0),),
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
         Fault("RIL-673", "turned, degrees", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
@@ -412,6 +414,18 @@ def judge_repetition(share: float) -> Finding:
     """Share of the matches that look as well elsewhere, as on rows of plants."""
     text = f"{100 * share:.0f} % of the matches look as well elsewhere on their epipolar lines"
     return judge("repetition", text, {"repeated": share})
+
+
+def judge_ground(facts: GroundFacts) -> Finding:
+    """How high the camera stands above the ground of a pair, or why none is seen: facts of stage ``ground_frame``."""
+    if "warnings" in facts:
+        return judge("ground", facts["warnings"][0], {"above": 1})
+    if facts["plane"] is None or "no_ground" in facts:
+        return judge("ground", facts["no_ground"])
+    x, y, z = facts["plane"]
+    height = -z / math.sqrt(1.0 + x * x + y * y)
+    share = f"{facts['ground_share']:.0%} of the matches"
+    return judge("ground", f"the left camera stands {height:.3g} m above it, if the baseline is right; {share} lie on it")
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:

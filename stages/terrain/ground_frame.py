@@ -46,9 +46,16 @@ from rille.stages.terrain.ground import (
     view_matches,
 )
 from rille.stages.terrain.matches import Matches
+from rille.stages.terrain.reference import MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE
 
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
+
+HANGING = (
+    "what looks like ground lies above the cameras: are the images of both mirrored top to bottom, which mirrors the "
+    "world, or upside down (then turn them by 180 degrees and exchange left and right, or state world.up), or is it a "
+    "ceiling?"
+)
 
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
@@ -141,6 +148,19 @@ def level(
         facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height)
         facts["ground_share"], facts["ground_reach"] = ground.inliers, ground.reach
     return facts
+
+
+def _surely(share: float, reach: float) -> bool:
+    """Whether a plane of this share of the matches and reach, camera heights, is ground by itself."""
+    return share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS
+
+
+def _hangs(samples: Samples) -> bool:
+    """Whether a plane above the cameras would be ground by itself if the images were mirrored top to bottom."""
+    with suppress(DegenerateError):
+        plane = fit_plane(samples, lambda n: _allowed(n * [1.0, -1.0, 1.0], None))
+        return _surely(plane.inliers, plane.reach)
+    return False
 
 
 def _explained(
@@ -344,4 +364,7 @@ def ground_frame_stage(
     facts = level(Matches.of(disparity), given, params, VerticalHint(up, pitch), reference)
     if why is not None:
         facts["why"] = why
+    if reference is None and not _surely(facts["ground_share"], facts.get("ground_reach", 0.0)):
+        samples = sampled(Matches.of(disparity), given, params.sigma_disparity)
+        facts |= {"warnings": [HANGING]} if _hangs(samples) else {}
     return Bundle({}, facts)

@@ -22,7 +22,7 @@ from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
-from rille.pipeline.flow.reconstruction import spread
+from rille.pipeline.flow.reconstruction import spread, vertical
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
@@ -188,6 +188,9 @@ class Inspection:
         self.say(judge.judge_epipolar(oriented.meta))
         alike = yield self.make.repetition("repetition", [pair])
         self.say(judge.judge_repetition(alike.meta["repeated"]))
+        level = self.make.level(pair, vertical(self.make, pair), self.make.rig([pair])[1])
+        yield Maybe([level])
+        self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
     def _times(self, whole: list[int]) -> Steps:
         """Whether left and right are of one time; where they are not, from which pair on."""

@@ -78,6 +78,7 @@ def test_a_sound_folder_passes(tmp_path, capsys):
     assert not [text for text in lines if text.startswith(("WARN", "FAIL"))]
     assert "median 4 m" in line(lines, "matching")
     assert line(lines, "sides").startswith("OK")
+    assert "no ground plane" in line(lines, "ground")
     assert "4 of 4 pairs" in line(lines, "sequence")
 
 
