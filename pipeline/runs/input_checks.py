@@ -424,8 +424,8 @@ def judge_ground(facts: GroundFacts) -> Finding:
         return judge("ground", facts["no_ground"])
     x, y, z = facts["plane"]
     height = -z / math.sqrt(1.0 + x * x + y * y)
-    share = f"{facts['ground_share']:.0%} of the matches"
-    return judge("ground", f"the left camera stands {height:.3g} m above it, if the baseline is right; {share} lie on it")
+    share = f"{facts['ground_share']:.0%} of the matches lie on it"
+    return judge("ground", f"the left camera stands {height:.3g} m above it, if the baseline is right; {share}")
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:

@@ -295,7 +295,7 @@ def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
 
 @pytest.mark.parametrize("pitch", [0.0, 12.0])
 def test_images_that_are_mirrored_top_to_bottom_show_ground_above_the_cameras(pitch: float) -> None:
-    """Of parallel cameras matches, epipolar lines and motions of such images are faultless, and the world is mirrored."""
+    """Of parallel cameras matches, epipolar lines and motions are faultless then, and the world is mirrored."""
     cam = Camera(350.0, 350.0, 199.5, 64.5, 400, 130)
     rig = Rig(cam, cam, RigidTransform(np.eye(3), [-0.54, 0.0, 0.0]))
     scene = nearest(plane(0.0, 0.0, -1.65), box((-9.0, 0.0, -1.65), (-5.0, 200.0, 9.0)))
