@@ -229,7 +229,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world")
+        begin = posed.meta["positions"][row[start]]
+        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", begin=begin and begin[:2])
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
