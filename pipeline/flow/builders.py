@@ -162,16 +162,17 @@ class Builder:
         return self.graph.call(stage, label, chosen, **given)
 
     def recalibrate(self, correction: list[float], since: int) -> None:
-        """Go on with the calibration corrected; what does not rest on it is the same task as before.
-
-        The tasks laid out ``since`` a number are of no account any more, unless they are laid out again.
-        """
+        """Go on with the calibration corrected; what does not rest on it is the same task as before."""
         self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
+        self.again(since)
+        for cached in ("given_rig", "given_lenses"):
+            self.__dict__.pop(cached, None)
+
+    def again(self, since: int) -> None:
+        """The tasks laid out ``since`` a number are of no account any more, unless they are laid out again."""
         self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
         self.products.contradictions.clear()
-        for cached in ("given_rig", "given_lenses"):
-            self.__dict__.pop(cached, None)
 
     # -- images -------------------------------------------------------------------------------------------------
 

@@ -113,6 +113,9 @@ ODD = (
 )
 """Cause of a frame that is lost by its rig."""
 
+TORN = "it shows two motions, and without it the frames beside it show one: its images are torn, or something passed by"
+"""Cause of a frame that is lost by its motions."""
+
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
 
@@ -151,10 +154,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
+    torn: set[int] | None = None
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening)
+        found = yield from simultaneous(make, frames, whole, screening, dict.fromkeys(torn or (), TORN))
         chain, chosen = found.chain, found.keyframes
         if chosen is None:
             return
@@ -169,6 +173,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.resections = [s.resection for s in segments]
+        wanted = without(segments, chain, torn)
+        if wanted != (torn or set()):
+            torn = wanted
+            make.again(since)
+            continue
         asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break
@@ -290,19 +299,19 @@ class Simultaneous:
 
 
 def simultaneous(
-    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
 ) -> Generator[Wait, Any, Simultaneous]:
     """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
 
-    Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
-    not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
-    each other: nothing is measured with these then.
+    Frames are lost as they were ``found`` to be, or are anew where some are of two times, where they are ``odd`` (cause
+    by frame), and where left and right do not fit each other as those of their neighbours do. No choice where the
+    images of most pairs contradict the rig, or each other: nothing is measured with these then.
     """
-    p, mode, wrong, odd = make.products, make.config.rig.mode, set[int](), set[int]()
+    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
         chain = [f for f in found.meta["chain"] if f not in odd]
-        lost = [*found.meta["lost"], *({"frame": f, "cause": ODD} for f in sorted(odd))]
+        lost = [*found.meta["lost"], *({"frame": f, "cause": odd[f]} for f in sorted(odd))]
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
         late = found.meta.get("late", [])
         if late and not p.contradictions:
@@ -358,13 +367,33 @@ def simultaneous(
         alone = [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]
         if alone and not late and 4 * len(bad) <= len(basic):
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= set(alone)
+            odd |= dict.fromkeys(alone, ODD)
             continue
         if not any("knocked" in one.meta for one in judged):
             return Simultaneous(chain, lost, chosen, known)
         p.contradictions.append(p.rigs[basic[0]])
         # One calibration does not describe this rig: each pair has its own.
         mode = "per_pair"
+
+
+def without(segments: list[Segment], chain: list[int], tried: set[int] | None) -> set[int]:
+    """Frames to go on without: the first of those that show two motions, or the one before it, in which many landmarks
+    were lost; of those that were ``tried``, the ones behind which nearly all landmarks have one motion.
+
+    Behind something that moves by itself they show two as well.
+    """
+    # A plan may have no facts.
+    parts = [s.resection.ref.meta.get("per_frame", []) for s in segments if s.resection.ref is not None]
+    facts = {one["frame"]: one for part in parts for one in part[1:]}
+    if tried is not None:
+        behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
+        # 0.8: of its landmarks.
+        return {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
+    doubted = {f for f, one in facts.items() if "contradiction" in one}
+    # 0.5: of the landmarks that the frame before shows.
+    thin = {one["frame"] for part in parts for was, one in pairwise(part) if one["inliers"] < 0.5 * was["inliers"]}
+    first = [(a, b) for a, b, _ in zip(chain, chain[1:], chain[2:], strict=False) if b in doubted and a not in doubted]
+    return {a if a in thin else b for a, b in first}
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
