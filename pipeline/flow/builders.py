@@ -309,7 +309,8 @@ class Builder:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
         first = None if self.correction is None else self.uncorrected.rig.to_dict()
-        found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig, first=first)
+        given = {"rig": self.given_rig, "first": first, "lenses": self.given_lenses}
+        found = self.node(rig_stage, f"rig{which}", orientations=orientations, **given)
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
     def level(

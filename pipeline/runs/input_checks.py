@@ -126,6 +126,7 @@ LIMITS = {
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
+    "distortion": (InputLimit("RIL-681", "misread", most=0),),
     "ground": (InputLimit("RIL-679", "above", most=0),),
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),

@@ -9,13 +9,14 @@ contradict, or would change by too little to matter stays as given, to the last 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
 from pydantic import Field
 
+from rille.stages.calibration.lens_reading import better_reading
 from rille.stages.calibration.parameter_selection import (
     BEYOND_SHARE,
     Decision,
@@ -49,6 +50,7 @@ from rille.stages.geometry.epipolar import (
     standing,
 )
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
 from rille.stages.numeric.robust import mad_sigma
@@ -322,7 +324,12 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
 
 @stage("rig", version=3)
 def rig_stage(
-    params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig, first: Rig | None = None
+    params: RigParams,
+    orientations: Sequence[Bundle[OrientationFacts]] = (),
+    *,
+    rig: Rig,
+    first: Rig | None = None,
+    lenses: Mapping[str, Any] | None = None,
 ) -> Bundle[RigFacts]:
     """The rig: the given calibration, repaired where the images contradict it."""
     pairs = [
@@ -333,4 +340,10 @@ def rig_stage(
         )
         for found in orientations
     ]
-    return Bundle({}, orient_rig(rig, pairs, params, first))
+    facts = orient_rig(rig, pairs, params, first)
+    opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
+    both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened
+    if opened and pairs and (misread := better_reading(rig, both, pairs)):
+        facts["misread"] = misread
+        facts["warnings"].insert(0, misread)
+    return Bundle({}, facts)

@@ -53,6 +53,8 @@ class RigFacts(Facts):
     """Pairs whose rows the rig does not explain."""
     contradiction: NotRequired[str]
     """A correction that no mount makes."""
+    misread: NotRequired[str]
+    """By which reading of the lenses' coefficients the matches fit better."""
     knocked: NotRequired[str]
     """A rig that one calibration does not describe."""
 

@@ -188,8 +188,11 @@ class Inspection:
         self.say(judge.judge_epipolar(oriented.meta))
         alike = yield self.make.repetition("repetition", [pair])
         self.say(judge.judge_repetition(alike.meta["repeated"]))
-        level = self.make.level(pair, vertical(self.make, pair), self.make.rig([pair])[1])
+        fitted, known = self.make.rig([pair])
+        level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
+        if fitted.ref and "misread" in fitted.ref.meta:
+            self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
     def _times(self, whole: list[int]) -> Steps:
