@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
+from contextlib import ExitStack
 from itertools import pairwise, product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from rille.pipeline.commands import batch
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
 from rille.pipeline.flow.reconstruction import spread, vertical
@@ -61,12 +64,20 @@ def _check(seq: str, options: Settings) -> int:
 
 def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Path) -> int:
     """Print a line for each finding; 0, or 1 where something fails."""
-    graph, store = Graph(), Store(cache)
-    name(graph, sequence, frames)
-    inspection = Inspection(Builder(graph, sequence, config), frames, store)
-    graph.flow(inspection.steps())
-    # In this process: workers would take longer to start than most of this takes.
-    result = run(graph, store, RunOptions(executor="inline", keep_going=True))
+    with ExitStack() as ends:
+        graph, store, kept = Graph(), Store(cache), list[Finding]()
+        try:
+            store.writable()
+        except StoreError as error:
+            # A check of data on a disk that is read only, say.
+            kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
+            store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
+        name(graph, sequence, frames)
+        inspection = Inspection(Builder(graph, sequence, config), frames, store)
+        inspection.say(*kept)
+        graph.flow(inspection.steps())
+        # In this process: workers would take longer to start than most of this takes.
+        result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     levels = inspection.levels
