@@ -20,7 +20,6 @@ from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
 from rille.stages.calibration.calibration import calibration_stage
 from rille.stages.calibration.orientation import orientation_stage
-from rille.stages.calibration.repetition import repetition_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
 from rille.stages.calibration.synchrony import synchrony_stage
@@ -29,7 +28,6 @@ from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import (
     CalibrationFacts,
     OrientationFacts,
-    RepetitionFacts,
     RigFacts,
     SwapFacts,
     SynchronyFacts,
@@ -298,12 +296,8 @@ class Builder:
     def orientation(self, pair: int) -> Handle[OrientationFacts]:
         """Relative orientation that the disparity of a pair asks for."""
         known = {"disparity": self.disparity(pair), "rig": self.given_rig}
+        known |= {camera: self.image(pair, camera) for camera in CAMERAS}
         return self.node(orientation_stage, f"orientation/{pair}", **known, pair=pair)
-
-    def repetition(self, label: str, pairs: Series[int]) -> Handle[RepetitionFacts]:
-        """Whether what some pairs show repeats."""
-        images = {camera: [self.image(pair, camera) for pair in pairs] for camera in CAMERAS}
-        return self.node(repetition_stage, label, **images, orientations=[self.orientation(pair) for pair in pairs])
 
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""

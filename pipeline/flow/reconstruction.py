@@ -22,7 +22,6 @@
                                                                                             trajectory <---------+
     lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
-    repetition:   rig -> repetition (images and matches of pairs that contradict it)
     wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
@@ -339,7 +338,7 @@ def simultaneous(
             # 12: pairs of doubtful rows that are compared with right images of other times at once.
             shown = spread(suspects, 12)
             asked = make.synchrony(f"synchrony{which}", shown, chain)
-            p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
+            p.contradictions.append(asked)
             apart = yield from done(asked)
             partners = apart.meta["partners"]
             if partners and not timed:

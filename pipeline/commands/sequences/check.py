@@ -197,8 +197,7 @@ class Inspection:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
-        alike = yield self.make.repetition("repetition", [pair])
-        self.say(judge.judge_repetition(alike.meta["repeated"]))
+        self.say(judge.judge_repetition(oriented.meta["repeated"]))
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])

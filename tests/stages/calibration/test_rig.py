@@ -53,7 +53,9 @@ def test_no_baseline_is_refused():
 def test_stage_reads_what_orientation_writes():
     rig = street_rig()
     bundles = [
-        Bundle({"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair})
+        Bundle(
+            {"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair, "repeated": 0.1}
+        )
         for m in street(pitch_deg=0.3)
     ]
     meta = rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
