@@ -244,15 +244,15 @@ def find_path(
 
 
 def _begun(ground: PathMaps, vehicle: Vehicle, begin: Cell) -> Cell | None:
-    """The cell nearest to where the rig began, of the connected ground over most rows; None where it lies within a
-    vehicle's length of the map's first or last rows."""
-    free = np.argwhere(ground.connected("middle", 0, None)[0])
-    if not len(free):
+    """The cell nearest to where the rig began, of the connected ground over most rows; None where the map reaches no
+    vehicle's length behind that place, or no farther ahead."""
+    length = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell)
+    far, near = row_span(~ground.closed)
+    free = np.argwhere(max((ground.connected(below, 0, None) for below in GROUNDS), key=lambda part: part[1])[0])
+    if not len(free) or begin[0] >= near - length:
         return None
     row, col = (int(k) for k in free[np.argmin(((free - begin) ** 2).sum(axis=1))])
-    far, near = row_span(~ground.closed)
-    length = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell)
-    return (row, col) if far + length < row < near - length else None
+    return (row, col) if row > far + length else None
 
 
 def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, params: PathParams) -> Route:
