@@ -25,6 +25,7 @@ from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.hfvm.given import MAX_REPEATED_SHARE
 from rille.stages.imaging.image_quality import grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
+from rille.stages.terrain.reference import camera_height
 
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
@@ -423,10 +424,8 @@ def judge_ground(facts: GroundFacts) -> Finding:
         return judge("ground", facts["warnings"][0], {"above": 1})
     if facts["plane"] is None or "no_ground" in facts:
         return judge("ground", facts["no_ground"])
-    x, y, z = facts["plane"]
-    height = -z / math.sqrt(1.0 + x * x + y * y)
-    share = f"{facts['ground_share']:.0%} of the matches lie on it"
-    return judge("ground", f"the left camera stands {height:.3g} m above it, if the baseline is right; {share}")
+    stands = f"the left camera stands {camera_height(facts):.3g} m above it, if the baseline is right"
+    return judge("ground", f"{stands}; {facts['ground_share']:.0%} of the matches lie on it")
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:
