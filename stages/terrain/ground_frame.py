@@ -57,6 +57,9 @@ HANGING = (
     "ceiling?"
 )
 
+UPRIGHT = np.array([0.0, -1.0, 0.0])
+"""Up in the frame of a camera whose vertical is not known."""
+
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
 BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
@@ -116,7 +119,7 @@ def level(
         return _on_ground(ground, R_local_left, samples, rig, source or GROUND_PLANE)
     except DegenerateError as error:
         why, other = _explained(error, samples, ground)
-    up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
+    up = UPRIGHT if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
     try:
@@ -150,16 +153,12 @@ def level(
     return facts
 
 
-def _surely(share: float, reach: float) -> bool:
-    """Whether a plane of this share of the matches and reach, camera heights, is ground by itself."""
-    return share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS
-
-
-def _hangs(samples: Samples) -> bool:
-    """Whether a plane above the cameras would be ground by itself if the images were mirrored top to bottom."""
+def _hangs(samples: Samples, up: Floats) -> bool:
+    """Whether a plane above the cameras, ``up`` (3,) being the vertical in their frame, would be ground by itself."""
     with suppress(DegenerateError):
-        plane = fit_plane(samples, lambda n: _allowed(n * [1.0, -1.0, 1.0], None))
-        return _surely(plane.inliers, plane.reach)
+        # cos 45 degrees: beyond, cameras look at the plane rather than along it, as backwards down from a drone.
+        plane = fit_plane(samples, lambda n: np.asarray(n @ up <= -0.7))
+        return plane.inliers >= MIN_REFERENCE_SHARE or plane.reach >= MIN_REACH_HEIGHTS
     return False
 
 
@@ -360,11 +359,12 @@ def ground_frame_stage(
     why: str | None = None,
 ) -> Bundle[GroundFacts]:
     """Vertical and reference plane of a basic pair; ``why``: the reason for a reference that is no ground."""
-    given = Rig.from_dict(rig.meta["rig"])
-    facts = level(Matches.of(disparity), given, params, VerticalHint(up, pitch), reference)
+    given, matches, hint = Rig.from_dict(rig.meta["rig"]), Matches.of(disparity), VerticalHint(up, pitch)
+    facts = level(matches, given, params, hint, reference)
     if why is not None:
         facts["why"] = why
-    if reference is None and not _surely(facts["ground_share"], facts.get("ground_reach", 0.0)):
-        samples = sampled(Matches.of(disparity), given, params.sigma_disparity)
-        facts |= {"warnings": [HANGING]} if _hangs(samples) else {}
+    surely = facts["ground_share"] >= MIN_REFERENCE_SHARE or facts.get("ground_reach", 0.0) >= MIN_REACH_HEIGHTS
+    if reference is None and not surely:
+        samples, known = sampled(matches, given, params.sigma_disparity), _given_vertical(hint)[0]
+        facts |= {"warnings": [HANGING]} if _hangs(samples, UPRIGHT if known is None else known) else {}
     return Bundle({}, facts)

@@ -309,6 +309,18 @@ def test_images_that_are_mirrored_top_to_bottom_show_ground_above_the_cameras(pi
         assert facts.get("warnings") == ([level_stage.HANGING] if warned else None)
 
 
+def test_a_drone_that_tilts_backwards_sees_no_ground_above() -> None:
+    T = pitched(110.0)  # 20 degrees beyond straight down
+    column, row, usable = disparity(RIG, T, plane(0.0, 0.0, -HEIGHT))
+    maps = {"column_disparity": column.astype("f4"), "row_disparity": row.astype("f4")}
+    maps |= {"validity": np.where(usable, Validity.MATCHED, 0).astype(np.uint8)}
+    maps |= {"backmatch_error": np.zeros(usable.shape, "f4")}
+    inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
+    facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
+    assert "no_ground" in facts
+    assert "warnings" not in facts
+
+
 @pytest.mark.data
 def test_kitti_street(data_dir: Path) -> None:
     """The cameras of the KITTI car are mounted 1.65 m above the road, level to a degree or two."""
