@@ -128,7 +128,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > BEYOND_SHARE and not turned:
+    if (share > BEYOND_SHARE or far) and not turned:
         left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
         refuse_impossible(rig, left, right, share)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)

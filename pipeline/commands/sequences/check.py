@@ -201,7 +201,9 @@ class Inspection:
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
-        if fitted.ref and "misread" in fitted.ref.meta:
+        if fitted.ref is None:
+            self.refused(_cause(fitted), "rig")
+        elif "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
