@@ -41,7 +41,6 @@ RUNS = {
 ELSEWHERE = {
     *(
         "calibration.mirror_check",
-        "calibration.repetition",
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",

@@ -22,7 +22,6 @@
                                                                                             trajectory <---------+
     lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
-    repetition:   rig -> repetition (images and matches of pairs that contradict it)
     wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
@@ -110,6 +109,9 @@ ODD = (
 )
 """Cause of a frame that is lost by its rig."""
 
+TORN = "it shows two motions, and without it the frames beside it show one: its images are torn, or something passed by"
+"""Cause of a frame that is lost by its motions."""
+
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
 
@@ -148,10 +150,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
+    torn: set[int] | None = None
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening)
+        found = yield from simultaneous(make, frames, whole, screening, dict.fromkeys(torn or (), TORN))
         if found.choice is None:
             return
         chain, chosen, basic = found.chain, found.choice.keyframes, found.choice.basic
@@ -165,6 +168,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.resections = [s.resection for s in segments]
+        wanted = without(segments, chain, torn)
+        if wanted != (torn or set()):
+            torn = wanted
+            make.again(since)
+            continue
         asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break
@@ -225,7 +233,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world")
+        begin = posed.meta["positions"][row[start]]
+        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", begin=begin and begin[:2])
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
@@ -316,11 +325,10 @@ def basic_pairs(
 
 
 def of_other_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
-    """Compare pairs of doubtful rows with right images of other times; and ask whether what they show repeats."""
+    """Compare pairs of doubtful rows with right images of other times."""
     # 12: pairs that are compared at once.
-    shown = spread(choice.suspects, 12)
-    asked = make.synchrony(f"synchrony{choice.which}", shown, chain)
-    make.products.contradictions += [asked, make.repetition(f"repetition{choice.which}", shown)]
+    asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
+    make.products.contradictions.append(asked)
     return (yield from done(asked))
 
 
@@ -345,19 +353,19 @@ class Simultaneous:
 
 
 def simultaneous(
-    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
 ) -> Generator[Wait, Any, Simultaneous]:
     """Choose basic pairs; while their rigs or images contradict each other, lose what does so and choose again.
 
-    Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
-    not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
-    each other: nothing is measured with these then.
+    Frames are lost as they were ``found`` to be, or are anew where some are of two times, where they are ``odd`` (cause
+    by frame), and where left and right do not fit each other as those of their neighbours do. No choice where the
+    images of most pairs contradict the rig, or each other: nothing is measured with these then.
     """
-    p, mode, wrong, odd = make.products, make.config.rig.mode, set[int](), set[int]()
+    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
         chain = [f for f in found.meta["chain"] if f not in odd]
-        lost = [*found.meta["lost"], *({"frame": f, "cause": ODD} for f in sorted(odd))]
+        lost = [*found.meta["lost"], *({"frame": f, "cause": odd[f]} for f in sorted(odd))]
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
         late = found.meta.get("late", [])
         if late and not p.contradictions:
@@ -389,13 +397,33 @@ def simultaneous(
         alone = set[int]() if late else misfits(choice, mode)
         if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= alone
+            odd |= dict.fromkeys(alone, ODD)
         elif any("knocked" in one.meta for one in choice.judged):
             p.contradictions.append(p.rigs[choice.basic[0]])
             # One calibration does not describe this rig: each pair has its own.
             mode = "per_pair"
         else:
             return Simultaneous(chain, lost, choice)
+
+
+def without(segments: list[Segment], chain: list[int], tried: set[int] | None) -> set[int]:
+    """Frames to go on without: the first of those that show two motions, or the one before it, in which many landmarks
+    were lost; of those that were ``tried``, the ones behind which nearly all landmarks have one motion.
+
+    Behind something that moves by itself they show two as well.
+    """
+    # A plan may have no facts.
+    parts = [s.resection.ref.meta.get("per_frame", []) for s in segments if s.resection.ref is not None]
+    facts = {one["frame"]: one for part in parts for one in part[1:]}
+    if tried is not None:
+        behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
+        # 0.8: of its landmarks.
+        return {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
+    doubted = {f for f, one in facts.items() if "contradiction" in one}
+    # 0.5: of the landmarks that the frame before shows.
+    thin = {one["frame"] for part in parts for was, one in pairwise(part) if one["inliers"] < 0.5 * was["inliers"]}
+    first = [(a, b) for a, b, _ in zip(chain, chain[1:], chain[2:], strict=False) if b in doubted and a not in doubted]
+    return {a if a in thin else b for a, b in first}
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:

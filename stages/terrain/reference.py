@@ -39,6 +39,13 @@ def seen_up(facts: GroundFacts) -> Floats | None:
     return _normal(facts) if facts["plane"] and facts["ground_share"] >= MIN_REFERENCE_SHARE else None
 
 
+def camera_height(facts: GroundFacts) -> float:
+    """Height, m, of the left camera above a pair's plane, along its normal."""
+    assert facts["plane"] is not None
+    x, y, z = facts["plane"]
+    return -z / math.sqrt(x * x + y * y + 1.0)
+
+
 def _normal(facts: GroundFacts) -> Floats:
     """Unit normal (3,) of a pair's plane in the left camera's frame."""
     assert facts["plane"] is not None
@@ -96,7 +103,6 @@ class _Plane(NamedTuple):
     @staticmethod
     def of(facts: GroundFacts) -> _Plane:
         """Read the plane of a pair."""
-        assert facts["plane"] is not None
         up = _normal(facts)
         level = float(RigidTransform.from_matrix(facts["T_local_left"]).rotation[2] @ up)
         share, reach = facts["ground_share"], facts["ground_reach"]
@@ -104,7 +110,7 @@ class _Plane(NamedTuple):
         is_level = is_known and level >= math.cos(math.radians(10.0))
         # Ground that is stated (``ground_frame.reference_height``), not seen, has a share of 0.
         is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == 0.0
-        return _Plane(up, -facts["plane"][2] * level, is_ground, share, reach)
+        return _Plane(up, camera_height(facts), is_ground, share, reach)
 
     def is_same(self, other: _Plane) -> bool:
         """Whether another pair shows the same plane."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,9 +22,10 @@ from rille.pipeline.commands import batch
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
-from rille.pipeline.flow.reconstruction import spread
+from rille.pipeline.flow.reconstruction import spread, vertical
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
@@ -58,12 +61,20 @@ def _check(seq: str, options: Settings) -> int:
 
 def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Path) -> int:
     """Print a line for each finding; 0, or 1 where something fails."""
-    graph, store = Graph(), Store(cache)
-    name(graph, sequence, frames)
-    inspection = Inspection(Builder(graph, sequence, config), frames, store)
-    graph.flow(inspection.steps())
-    # In this process: workers would take longer to start than most of this takes.
-    result = run(graph, store, RunOptions(executor="inline", keep_going=True))
+    with ExitStack() as ends:
+        graph, store, kept = Graph(), Store(cache), list[Finding]()
+        try:
+            store.writable()
+        except StoreError as error:
+            # A check of data on a disk that is read only, say.
+            kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
+            store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
+        name(graph, sequence, frames)
+        inspection = Inspection(Builder(graph, sequence, config), frames, store)
+        inspection.say(*kept)
+        graph.flow(inspection.steps())
+        # In this process: workers would take longer to start than most of this takes.
+        result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     levels = inspection.levels
@@ -184,8 +195,15 @@ class Inspection:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
-        alike = yield self.make.repetition("repetition", [pair])
-        self.say(judge.judge_repetition(alike.meta["repeated"]))
+        self.say(judge.judge_repetition(oriented.meta["repeated"]))
+        fitted, known = self.make.rig([pair])
+        level = self.make.level(pair, vertical(self.make, pair), known)
+        yield Maybe([level])
+        if fitted.ref is None:
+            self.refused(_cause(fitted), "rig")
+        elif "misread" in fitted.ref.meta:
+            self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
+        self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
     def _times(self, whole: list[int]) -> Steps:
         """Whether left and right are of one time; where they are not, from which pair on."""

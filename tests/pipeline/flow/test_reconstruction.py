@@ -273,7 +273,7 @@ def test_behind_an_image_that_one_camera_lost_all_frames_are_lost_and_those_befo
     assert products.trajectory.spec.args["lost"] == late["lost"]
     assert [h.label for h in products.contradictions] == ["synchrony/lost/5", "intrinsics"]
     assert products.contradictions[0].spec.args["pairs"] == [3, 4, 5, 6, 7]
-    assert {h.label for h in graph.nodes if h.index in graph.outdated} == {"rig", "synchrony", "repetition"}
+    assert {h.label for h in graph.nodes if h.index in graph.outdated} == {"rig", "synchrony"}
 
 
 @pytest.mark.parametrize("few", [True, False], ids=["few matches", "bad rows"])
