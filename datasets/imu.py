@@ -21,23 +21,15 @@ from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, rows_of
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
 Up = tuple[float, float, float] | None
 
-GRAVITY = 9.81
-"""m/s^2; on the ground it is 9.78 to 9.83."""
-
-FORCE_MARGIN = 0.2
-"""m/s^2, of the mean force off gravity: accelerometers of drones are biased by up to 0.1."""
-
-STEADY_FORCE = 0.2
-"""m/s^2, greatest standard deviation, on any axis, of means over 0.1 s: an accelerated body's force wanders."""
-
 STEADY_RATE = 0.02
-"""rad/s, likewise of the rate, where the sensor rests; rotors that idle shake it by 0.007."""
+"""rad/s, greatest standard deviation of means of the rate over 0.1 s where the sensor rests; rotors that idle shake it
+by 0.007."""
 
 BIN = 0.1
 """s; means over it are free of vibration."""
@@ -45,9 +37,6 @@ BIN = 0.1
 HALF_WINDOW = 1.0
 """s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
 flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; half the window triples that."""
-
-GAP = 2.5
-"""The same of a slow sensor, in median spacings: one missing sample (2) is common, more is not."""
 
 GYROSCOPE = re.compile(r"(.*[./])?(gyr|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
@@ -197,10 +186,20 @@ class Stretch:
         turns = self.attitude(moment).T @ self.turned[chosen]
         force = np.einsum("nij,nj->ni", turns, self.forces[chosen])
         mean = force.mean(axis=0)
-        steady = bins(force, self.times[chosen]).std(axis=0).max() <= STEADY_FORCE
-        # rad/s; while it turns faster, the mean force is not trusted: the sensor stands off the axis
-        slow = np.linalg.norm(self.rates[chosen].mean(axis=0)) <= 0.15
-        return mean if steady and slow and abs(np.linalg.norm(mean) - GRAVITY) <= FORCE_MARGIN else None
+        spread = bins(force, self.times[chosen]).std(axis=0)
+        return mean if bool(unaccelerated(mean, spread, self.rates[chosen].mean(axis=0))) else None
+
+
+def unaccelerated(force: Floats, spread: Floats, rate: Floats) -> Bools:
+    """Whether mean ``force`` (..., 3), m/s^2, is the reaction to gravity alone.
+
+    ``spread`` (..., 3): standard deviation of its means over 0.1 s; ``rate`` (..., 3): mean rate, rad/s.
+    """
+    # 9.81 m/s^2: 9.78 to 9.83 on the ground; accelerometers of drones are biased by up to 0.1.
+    level = np.abs(np.linalg.norm(force, axis=-1) - 9.81) <= 0.2
+    # An accelerated body's force wanders. While a sensor turns, its force is not trusted, for it stands off the axis;
+    # at rest cheap sensors have a rate of 0.08.
+    return np.asarray(level & (spread.max(axis=-1) <= 0.2) & (np.linalg.norm(rate, axis=-1) <= 0.15))
 
 
 def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -> Inertial:
@@ -238,16 +237,16 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
 
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:
     """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
-    usual = float(np.median(np.diff(imu.times)))
-    # A slow sensor's usual spacing is no gap, even where it exceeds this.
-    # 0.1 s: longest gap in the samples over which the rate is interpolated.
-    bridge = max(0.1, GAP * usual)
+    # 2.5 median spacings: one missing sample (2) is common, more is not.
+    slack = 2.5 * float(np.median(np.diff(imu.times)))
+    # 0.1 s: longest gap in the samples over which the rate is interpolated; a slow sensor's usual spacing is none.
+    bridge = max(0.1, slack)
     near = np.flatnonzero((imu.times >= start - bridge) & (imu.times <= end + bridge))
     out = []
     for part in np.split(near, np.flatnonzero(np.diff(imu.times[near]) > bridge) + 1):
         if part.size >= 2:
             times, rates = imu.times[part], imu.rates[part] - (0.0 if bias is None else bias)
-            out.append(Stretch(times, rates, imu.forces[part], integrate(times, rates), GAP * usual))
+            out.append(Stretch(times, rates, imu.forces[part], integrate(times, rates), slack))
     return out
 
 
@@ -279,13 +278,7 @@ def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | Non
     rates, forces = (np.lib.stride_tricks.sliding_window_view(v, count, axis=0) for v in (rate, force))
     shaken = rates.std(axis=-1).max(axis=-1)
     mean = rates.mean(axis=-1)
-    # rad/s; the mean rate of a resting sensor. Cheap gyroscopes have 0.08, faster ones turn indeed.
-    rest = (
-        (shaken <= STEADY_RATE)
-        & (forces.std(axis=-1).max(axis=-1) <= STEADY_FORCE)
-        & (np.abs(np.linalg.norm(forces.mean(axis=-1), axis=-1) - GRAVITY) <= FORCE_MARGIN)
-        & (np.linalg.norm(mean, axis=-1) <= 0.15)
-    )
+    rest = (shaken <= STEADY_RATE) & unaccelerated(forces.mean(axis=-1), forces.std(axis=-1), mean)
     if not rest.any():
         return None, (NO_BIAS,)
     quietest = int(np.flatnonzero(rest)[np.argmin(shaken[rest])])

@@ -40,7 +40,7 @@ RUNS = {
 }
 ELSEWHERE = {
     *(
-        "calibration.repetition",
+        "calibration.mirror_check",
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",

@@ -14,8 +14,6 @@ from rille.datasets.cameras.model import CalibratedCamera, stereo_cameras
 from rille.stages.geometry.lens import Lens
 
 MODELS = ("pinhole", "pinhole_radial_tangential")
-MAX_RADIAL = 3
-"""Radial coefficients that are read."""
 
 
 def boofcv(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -40,9 +38,9 @@ def _lens(f: Fields) -> Lens:
         return Lens(camera)
     bent = f.sub("radial_tangential")
     radial = bent.numbers("radial") if "radial" in bent else ()
-    if len(radial) > MAX_RADIAL:
-        text = f"has {len(radial)} numbers, at most {MAX_RADIAL} are read"
+    if len(radial) > 3:
+        text = f"has {len(radial)} numbers, at most 3 are read"
         raise bent.error("RIL-105", "radial", text, "calibrate with fewer")
-    k1, k2, k3 = (*radial, *(0.0,) * (MAX_RADIAL - len(radial)))
+    k1, k2, k3 = (*radial, 0.0, 0.0, 0.0)[:3]
     coefficients = (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), k3)
     return bent.lens("radial", camera, "radtan", coefficients if k3 else coefficients[:4])

@@ -32,9 +32,6 @@ UNIT = re.compile(r"<[^<>]{0,40}>")
 COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
 """Components that each model has at least."""
 
-SKEW = 1e-6
-"""Share of the focal length below which columns and rows are perpendicular."""
-
 
 def attached(path: Path) -> str:
     """The label at the beginning of a file that is an image; empty where it has none."""
@@ -96,7 +93,7 @@ def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
     a, h, v = model.a, model.h, model.v
     cx, cy = float(h @ a), float(v @ a)
     fx = float(np.linalg.norm(h - cx * a))
-    if fx <= SKEW * abs(cx):
+    if fx <= 1e-6 * abs(cx):
         raise f.error("RIL-957", "MODEL_COMPONENT_3", "is along the axis: the columns have no direction")
     # H = fx x + cx A and V = fy y + cy A, of axes x, y, A (Yakimovsky and Cunningham 1978).
     x = (h - cx * a) / fx
@@ -107,7 +104,8 @@ def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
     camera = f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE)
     axes = np.array([x, y, a])
     T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ model.c)
-    if not any(model.radial) and model.linearity == 1.0 and abs(skew) <= SKEW * fy:
+    # 1e-6 of the focal length: columns and rows are perpendicular then.
+    if not any(model.radial) and model.linearity == 1.0 and abs(skew) <= 1e-6 * fy:
         lens = Lens(camera)
     else:
         terms = (skew, *map(float, axes @ model.axis), *model.radial, model.linearity)

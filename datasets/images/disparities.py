@@ -26,9 +26,6 @@ from rille.stages.core.errors import InputError
 
 Sign = Literal["left-right", "right-left"]
 
-NODATA = 42113
-"""GDAL's TIFF tag: value of the pixels without data."""
-
 KINDS = "PFM, TIFF or npy of floating point (pixels), or 16-bit PNG (256 a pixel, 0 unknown)"
 
 
@@ -84,8 +81,9 @@ def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
     # Values of a 16-bit PNG a pixel
     # PFM's rows, which run from the bottom, and the byte order in its sign are Pillow's business.
     values = np.asarray(image, np.float32) / (256 if coded else 1)
-    if image.format == "TIFF" and NODATA in image.tag_v2:
-        values[values == np.float32(image.tag_v2[NODATA].strip("\0 "))] = np.nan
+    # GDAL's tag of TIFF: value of the pixels without data.
+    if image.format == "TIFF" and 42113 in image.tag_v2:
+        values[values == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
     return values
 
 

@@ -384,7 +384,7 @@ class World(Table):
     crs : projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg.
     origin : m; easting, northing and height of the first left camera's centre in that CRS.
     azimuth_deg : degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y
-        axis; of a camera within 10 degrees of straight down that of its images' upper edge.
+        axis; of a camera within 10 degrees of straight down that of its images' upper edge, up to 30 degrees between.
     """
 
     pitch_deg: float | None = Field(default=None, gt=-90, lt=90)

@@ -19,9 +19,6 @@ from rille.stages.core.arrays import Floats, Floats32
 OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
 """Spacings of the relief's octaves, metres. Finer relief is drawn as grain: no camera resolves its shape."""
 
-HURST = 0.85
-"""Amplitude ~ wavelength^HURST: natural terrain is self-affine with 0.7-0.9 (e.g. Rosenburg 2011, LOLA)."""
-
 MIN_ROCK_M, MAX_ROCK_M = 0.004, 0.11
 MIN_CRATER_M, MAX_CRATER_M = 0.025, 0.35
 NO_CEILING_M = -1e9  # m: the ceiling of the shade where there is none
@@ -53,7 +50,8 @@ def relief(p: SceneParams, shape: tuple[int, int]) -> Floats32:
     """Fractal relief, float32 metres, mean zero."""
     out = np.zeros(shape, np.float32)
     for k, wave in enumerate(OCTAVES):
-        amplitude = p.relief * (wave / OCTAVES[0]) ** HURST
+        # Hurst's exponent: natural terrain is self-affine with 0.7-0.9 (e.g. Rosenburg 2011, LOLA).
+        amplitude = p.relief * (wave / OCTAVES[0]) ** 0.85
         if wave >= 2.0 * p.cell:
             add_octave(out, wave / p.cell, amplitude, stream(p.seed, 10 + k))
     return out

@@ -60,9 +60,6 @@ workers of our own may take to start, on a machine that others use."""
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
 
-DEATHS = 1
-"""Deaths of its worker after which dask, on this machine, begins a task once more; at the next it gives it back."""
-
 
 @dataclass(frozen=True)
 class Call:
@@ -526,7 +523,8 @@ def _configure() -> None:
     memory = {f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")}
     dask.config.set(
         {
-            "distributed.scheduler.allowed-failures": DEATHS,
+            # After one death of its worker dask begins a task once more; at the next it gives it back.
+            "distributed.scheduler.allowed-failures": 1,
             # By default a cluster forgets a worker for good whose nanny has not started it again within 15 s, which on
             # a busy machine is usual.
             "distributed.deploy.lost-worker-timeout": "1h",

@@ -27,9 +27,6 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 
-BLOCK_BYTES = 1024
-"""Bytes a row of the array that holds a file: a chunk of an artifact is 1024 x 1024 then."""
-
 CONTENT = Array("content", ("block", "byte"), "uint8", "1", "bytes of the files, one behind another")
 
 
@@ -141,7 +138,8 @@ def pack(folder: Path) -> Bundle:
     # Sorted: file systems list a folder in any order, and equal files must make equal artifacts.
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     data = np.frombuffer(b"".join(files.values()), dtype=np.uint8)
-    blocks = np.zeros((-(-len(data) // BLOCK_BYTES), BLOCK_BYTES), dtype=np.uint8)
+    # Rows of 1024 bytes: a chunk of an artifact is 1024 x 1024 then.
+    blocks = np.zeros((-(-len(data) // 1024), 1024), dtype=np.uint8)
     blocks.reshape(-1)[: len(data)] = data
     return Bundle({"content": blocks}, {"files": [[name, len(content)] for name, content in files.items()]})
 

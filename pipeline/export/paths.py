@@ -44,8 +44,6 @@ INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined cartesian', -1, 'NONE', -1, 
 INSERT INTO gpkg_spatial_ref_sys VALUES ('undefined geographic', 0, 'NONE', 0, 'undefined', NULL);
 """
 
-WGS84 = 4326  # in EPSG's numbers; each GeoPackage must define it
-
 COLUMN_TYPES = {str: "TEXT", bool: "BOOLEAN", int: "INTEGER", float: "DOUBLE"}
 """SQL types of properties."""
 
@@ -83,7 +81,8 @@ def _enter_crs(package: sqlite3.Connection, place: Georeference | None) -> int:
     from rasterio.crs import CRS
 
     row = "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)"
-    package.execute(row, ("WGS 84", WGS84, "EPSG", WGS84, CRS.from_epsg(WGS84).to_wkt()))
+    # Each GeoPackage must define EPSG:4326.
+    package.execute(row, ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt()))
     crs = None if place is None else CRS.from_user_input(place.crs)
     number, wkt = (None, ENGINEERING_CRS) if crs is None else (crs.to_epsg(), crs.to_wkt())
     # Number within a GeoPackage of a coordinate system that has none of the EPSG

@@ -28,7 +28,7 @@ from rille.stages.geometry.rigid import posed
 
 FRAME = (
     "right-handed, metres: origin at the first left camera's centre, z up, y the horizontal projection of its "
-    "optical axis, x right"
+    "optical axis (of one that looks straight down that of its images' upper edge), x right"
 )
 """The world frame in words; every file repeats it where its format allows."""
 

@@ -19,8 +19,8 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
 from rille.stages.calibration.calibration import calibration_stage
+from rille.stages.calibration.mirror_check import mirror_check_stage
 from rille.stages.calibration.orientation import orientation_stage
-from rille.stages.calibration.repetition import repetition_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
 from rille.stages.calibration.synchrony import synchrony_stage
@@ -28,8 +28,8 @@ from rille.stages.core.declare import F, NoParams, Params, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import (
     CalibrationFacts,
+    MirrorFacts,
     OrientationFacts,
-    RepetitionFacts,
     RigFacts,
     SwapFacts,
     SynchronyFacts,
@@ -162,16 +162,17 @@ class Builder:
         return self.graph.call(stage, label, chosen, **given)
 
     def recalibrate(self, correction: list[float], since: int) -> None:
-        """Go on with the calibration corrected; what does not rest on it is the same task as before.
-
-        The tasks laid out ``since`` a number are of no account any more, unless they are laid out again.
-        """
+        """Go on with the calibration corrected; what does not rest on it is the same task as before."""
         self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
+        self.again(since)
+        for cached in ("given_rig", "given_lenses"):
+            self.__dict__.pop(cached, None)
+
+    def again(self, since: int) -> None:
+        """The tasks laid out ``since`` a number are of no account any more, unless they are laid out again."""
         self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
         self.products.contradictions.clear()
-        for cached in ("given_rig", "given_lenses"):
-            self.__dict__.pop(cached, None)
 
     # -- images -------------------------------------------------------------------------------------------------
 
@@ -255,6 +256,11 @@ class Builder:
         images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
 
+    def mirrored(self, pair: int) -> Handle[MirrorFacts]:
+        """Whether one image of a pair is mirrored."""
+        images = {camera: self.image(pair, camera) for camera in CAMERAS}
+        return self.node(mirror_check_stage, f"mirror_check/{pair}", **images, rig=self.given_rig)
+
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
         """Which right images, of those of some frames about each pair, are of the time of the left ones."""
         at = [frames.index(pair) for pair in pairs]
@@ -297,18 +303,15 @@ class Builder:
     def orientation(self, pair: int) -> Handle[OrientationFacts]:
         """Relative orientation that the disparity of a pair asks for."""
         known = {"disparity": self.disparity(pair), "rig": self.given_rig}
+        known |= {camera: self.image(pair, camera) for camera in CAMERAS}
         return self.node(orientation_stage, f"orientation/{pair}", **known, pair=pair)
-
-    def repetition(self, label: str, pairs: Series[int]) -> Handle[RepetitionFacts]:
-        """Whether what some pairs show repeats."""
-        images = {camera: [self.image(pair, camera) for pair in pairs] for camera in CAMERAS}
-        return self.node(repetition_stage, label, **images, orientations=[self.orientation(pair) for pair in pairs])
 
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
         """The rig that the orientations of these pairs agree on, and what of it other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
         first = None if self.correction is None else self.uncorrected.rig.to_dict()
-        found = self.node(rig_stage, f"rig{which}", orientations=orientations, rig=self.given_rig, first=first)
+        given = {"rig": self.given_rig, "first": first, "lenses": self.given_lenses}
+        found = self.node(rig_stage, f"rig{which}", orientations=orientations, **given)
         return found, self.node(calibration_stage, f"calibration{which}", rig=found)
 
     def level(

@@ -22,7 +22,6 @@
                                                                                             trajectory <---------+
     lost frames:  image -> image_quality -> frame_screening <- swap_check (left against right; where it asks)
     other times:  rig -> synchrony (features of right images nearby) -> keyframes, chosen anew
-    repetition:   rig -> repetition (images and matches of pairs that contradict it)
     wrong camera: resect -> intrinsics -> given rig: all that reads it is laid out anew
     pose of an adjusted trajectory: pose (pair) <- trajectory as chained, local DEM
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
@@ -100,9 +99,6 @@ from rille.stages.terrain.tile_index import tile_index_stage
 TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
-SEAMS = 24
-"""Earlier models that a model is compared with: enough to tell which is off, however often a place is seen again."""
-
 
 CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
@@ -112,6 +108,9 @@ ODD = (
     "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
 )
 """Cause of a frame that is lost by its rig."""
+
+TORN = "it shows two motions, and without it the frames beside it show one: its images are torn, or something passed by"
+"""Cause of a frame that is lost by its motions."""
 
 Steps = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
@@ -151,24 +150,29 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
+    torn: set[int] | None = None
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening)
-        chain, chosen = found.chain, found.keyframes
-        if chosen is None:
+        found = yield from simultaneous(make, frames, whole, screening, dict.fromkeys(torn or (), TORN))
+        if found.choice is None:
             return
+        chain, chosen, basic = found.chain, found.choice.keyframes, found.choice.basic
         # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
         lost = sorted([*missing, *found.lost], key=lambda item: item["frame"])
-        basic = [chain[i] for i in chosen.meta["basic"]]
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, found.rigs)
+        matched = yield from matched_pairs(make, found.choice.rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
         ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.resections = [s.resection for s in segments]
+        wanted = without(segments, chain, torn)
+        if wanted != (torn or set()):
+            torn = wanted
+            make.again(since)
+            continue
         asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
         if asked is None or turn == CALIBRATIONS:
             break
@@ -229,7 +233,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world")
+        begin = posed.meta["positions"][row[start]]
+        p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", begin=begin and begin[:2])
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
@@ -278,92 +283,147 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
 
 
 @dataclass(frozen=True)
+class Choice:
+    """Basic pairs, the rig of each, and the facts of these rigs; ``suspects`` are pairs of doubtful rows, and ``which``
+    ends the labels of its tasks."""
+
+    which: str
+    keyframes: Ref[KeyframesFacts]
+    basic: list[int]
+    rigs: dict[int, Handle[CalibrationFacts]]
+    judged: list[Ref[RigFacts]]
+    suspects: list[int]
+
+
+def basic_pairs(
+    make: Builder, chain: list[int], unfit: set[int], behind: list[int], mode: str
+) -> Generator[Wait, Any, Choice]:
+    """Choose basic pairs of a ``chain`` of frames, and find their rigs: one for all pairs, or one each (``mode``).
+
+    No ``unfit`` frame is basic; ``behind`` are places in the chain behind a frame that has no pose.
+    """
+    p = make.products
+    # Each contradiction leads to another choice.
+    which = f"/{len(p.contradictions)}" if p.contradictions else ""
+    p.keyframes = make.node(
+        keyframes_stage,
+        f"keyframes{which}",
+        steps=steps(make, chain),
+        frames=len(chain),
+        unfit=[k for k, f in enumerate(chain) if f in unfit] or None,
+        behind=behind or None,
+    )
+    yield Complete(("motion", "step_table"))
+    chosen = yield from done(p.keyframes)
+    basic = [chain[i] for i in chosen.meta["basic"]]
+    pooled = mode != "per_pair" and make.rig(representative(basic), which)
+    rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
+    p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
+    judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
+    suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
+    return Choice(which, chosen, basic, known, judged, suspects)
+
+
+def of_other_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
+    """Compare pairs of doubtful rows with right images of other times."""
+    # 12: pairs that are compared at once.
+    asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
+    make.products.contradictions.append(asked)
+    return (yield from done(asked))
+
+
+def misfits(choice: Choice, mode: str) -> set[int]:
+    """Pairs that do not fit the rig as their neighbours do; none where many pairs do not: these bend the rig itself."""
+    basic, facts = choice.basic, [rig.meta.get("per_pair", ()) for rig in choice.judged]
+    fitting = {one["pair"] for pairs in facts for one in pairs}.difference(choice.suspects)
+    bad = set(basic if mode == "per_pair" else representative(basic)) - fitting
+    # A rig that moved did so for the next pairs, too.
+    alone = {b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}}
+    return alone if 4 * len(bad) <= len(basic) else set()
+
+
+@dataclass(frozen=True)
 class Simultaneous:
-    """Frames of the ``chain``, those that are ``lost`` (frame and cause), basic pairs, None where nothing can be
-    measured, and the rig of each."""
+    """Frames of the ``chain``, those that are ``lost`` (frame and cause), and the choice of basic pairs, None where
+    nothing can be measured."""
 
     chain: list[int]
     lost: list[dict[str, Any]]
-    keyframes: Ref[KeyframesFacts] | None
-    rigs: dict[int, Handle[CalibrationFacts]]
+    choice: Choice | None
 
 
 def simultaneous(
-    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts]
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
 ) -> Generator[Wait, Any, Simultaneous]:
-    """Choose basic pairs whose images are of one time, and find their rigs: one for all pairs, or one each.
+    """Choose basic pairs; while their rigs or images contradict each other, lose what does so and choose again.
 
-    Frames are lost as they were ``found`` to be, or are anew where some are of two times, and where left and right do
-    not fit each other as those of their neighbours do. No choice where the images of most pairs contradict the rig, or
-    each other: nothing is measured with these then.
+    Frames are lost as they were ``found`` to be, or are anew where some are of two times, where they are ``odd`` (cause
+    by frame), and where left and right do not fit each other as those of their neighbours do. No choice where the
+    images of most pairs contradict the rig, or each other: nothing is measured with these then.
     """
-    p, mode, wrong, odd = make.products, make.config.rig.mode, set[int](), set[int]()
+    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
         chain = [f for f in found.meta["chain"] if f not in odd]
-        lost = [*found.meta["lost"], *({"frame": f, "cause": ODD} for f in sorted(odd))]
+        lost = [*found.meta["lost"], *({"frame": f, "cause": odd[f]} for f in sorted(odd))]
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
         late = found.meta.get("late", [])
         if late and not p.contradictions:
             p.contradictions.append(lost_by_time(make, late, whole))
-        # Each contradiction leads to another choice.
-        which = f"/{len(p.contradictions)}" if p.contradictions else ""
-        p.keyframes = make.node(
-            keyframes_stage,
-            f"keyframes{which}",
-            steps=steps(make, chain),
-            frames=len(chain),
-            unfit=[k for k, f in enumerate(chain) if f in wrong or f in found.meta["unfit"]] or None,
-            behind=behind or None,
-        )
-        yield Complete(("motion", "step_table"))
-        chosen = yield from done(p.keyframes)
-        basic = [chain[i] for i in chosen.meta["basic"]]
-        # The rig's time grows with the pairs; of 200 its errors are systematic.
-        pooled = mode != "per_pair" and make.rig(spread(basic, 200), which)
-        rigs = {k: pooled or make.rig([k], f"/{k}{which}") for k in basic}
-        p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
-        judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
-        suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
-        if suspects:
-            # 12: pairs of doubtful rows that are compared with right images of other times at once.
-            shown = spread(suspects, 12)
-            asked = make.synchrony(f"synchrony{which}", shown, chain)
-            p.contradictions += [asked, make.repetition(f"repetition{which}", shown)]
-            apart = yield from done(asked)
+        choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
+        if choice.suspects:
+            apart = yield from of_other_times(make, choice, chain)
             partners = apart.meta["partners"]
             if partners and not timed:
                 # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
                 timed = True
                 again = yield from screened(make, whole, timed)
                 if again.meta["lost"] != found.meta["lost"]:
-                    make.graph.outdated |= {one.index for one in (asked, *p.rigs.values())}
+                    make.graph.outdated |= {one.index for one in (*p.contradictions, *p.rigs.values())}
                     found = again
                     p.contradictions.clear()
                     continue
-            contradicted = any("contradiction" in one.meta for one in (apart, *judged))
-            if contradicted and 2 * len(suspects) > len(basic):
+            contradicted = any("contradiction" in one.meta for one in (apart, *choice.judged))
+            if contradicted and 2 * len(choice.suspects) > len(choice.basic):
                 # A rig that images of two times show is none: a camera that moves in it did not.
                 p.rigs = {} if partners else p.rigs
                 if late and partners:
                     p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
-                return Simultaneous(chain, lost, None, {})
+                return Simultaneous(chain, lost, None)
             if partners:
                 wrong |= {pair for pair, _ in partners}
                 continue
-        fitting = {one["pair"] for rig in judged for one in rig.meta.get("per_pair", ())}.difference(suspects)
-        bad = set(spread(basic, 200) if pooled else basic) - fitting
-        # A rig that moved did so for the next pairs, too; one that images of two times or many pairs bend judges none.
-        alone = [b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}]
-        if alone and not late and 4 * len(bad) <= len(basic):
+        # A rig that images of two times bend judges no pair.
+        alone = set[int]() if late else misfits(choice, mode)
+        if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= set(alone)
-            continue
-        if not any("knocked" in one.meta for one in judged):
-            return Simultaneous(chain, lost, chosen, known)
-        p.contradictions.append(p.rigs[basic[0]])
-        # One calibration does not describe this rig: each pair has its own.
-        mode = "per_pair"
+            odd |= dict.fromkeys(alone, ODD)
+        elif any("knocked" in one.meta for one in choice.judged):
+            p.contradictions.append(p.rigs[choice.basic[0]])
+            # One calibration does not describe this rig: each pair has its own.
+            mode = "per_pair"
+        else:
+            return Simultaneous(chain, lost, choice)
+
+
+def without(segments: list[Segment], chain: list[int], tried: set[int] | None) -> set[int]:
+    """Frames to go on without: the first of those that show two motions, or the one before it, in which many landmarks
+    were lost; of those that were ``tried``, the ones behind which nearly all landmarks have one motion.
+
+    Behind something that moves by itself they show two as well.
+    """
+    # A plan may have no facts.
+    parts = [s.resection.ref.meta.get("per_frame", []) for s in segments if s.resection.ref is not None]
+    facts = {one["frame"]: one for part in parts for one in part[1:]}
+    if tried is not None:
+        behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
+        # 0.8: of its landmarks.
+        return {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
+    doubted = {f for f, one in facts.items() if "contradiction" in one}
+    # 0.5: of the landmarks that the frame before shows.
+    thin = {one["frame"] for part in parts for was, one in pairwise(part) if one["inliers"] < 0.5 * was["inliers"]}
+    first = [(a, b) for a, b, _ in zip(chain, chain[1:], chain[2:], strict=False) if b in doubted and a not in doubted]
+    return {a if a in thin else b for a, b in first}
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
@@ -579,7 +639,8 @@ def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handl
                 shared[other] += cells_in_both(box, theirs)
             here.append((pair, box))
         if shared:
-            nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:SEAMS]
+            # 24: enough to tell which is off, however often a place is seen again.
+            nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:24]
             others = [models[other] for other in sorted(nearest)]
             seams[pair] = make.node(overlap_qa_stage, f"overlap_qa/{pair}", dem=models[pair], others=others)
     return seams
@@ -589,6 +650,11 @@ def cells_in_both(a: Series[int], b: Series[int]) -> int:
     """Cells that two boxes (first column, first line, columns, lines) have in common."""
     columns, lines = (min(a[k] + a[k + 2], b[k] + b[k + 2]) - max(a[k], b[k]) for k in (0, 1))
     return max(columns, 0) * max(lines, 0)
+
+
+def representative(basic: list[int]) -> list[int]:
+    """Pairs by which one rig is found for all: its time grows with the pairs; of 200 its errors are systematic."""
+    return spread(basic, 200)
 
 
 def spread(items: list[Any], most: int) -> list[Any]:

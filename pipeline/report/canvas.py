@@ -24,8 +24,6 @@ from rille.pipeline.export.rasters import CLASSES
 WIDTH_INCHES = 4.6
 PIXELS_PER_INCH = 200
 """Resolution of rasters: twice what a panel takes on the screen."""
-CSS_PIXELS_PER_INCH = 96
-
 RISK = SAFE, CAUTION, HAZARDOUS, UNKNOWN = tuple(CLASSES.values())
 """Colours of the classes 0, 1, 2 and 3."""
 CLASS_NAMES = ("safe", "caution", "hazard", "unknown")
@@ -120,14 +118,16 @@ def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
         fig.savefig(out, format="webp", dpi=PIXELS_PER_INCH, pil_kwargs={"quality": 85})
         from PIL import Image
 
-        size = [round(n * CSS_PIXELS_PER_INCH / PIXELS_PER_INCH) for n in Image.open(out).size]
+        inches = [n / PIXELS_PER_INCH for n in Image.open(out).size]
     else:
         # No date and no version of matplotlib in it: equal figures make equal files.
         fig.savefig(out, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
         box = re.search(rb'viewBox="0 0 ([0-9.]+) ([0-9.]+)"', out.getvalue())
         assert box is not None
-        size = [round(float(points) * CSS_PIXELS_PER_INCH / 72) for points in box.groups()]
-    return Panel(address(out.getvalue(), "webp" if photo else "svg+xml"), alt, size[0], size[1])
+        inches = [float(points) / 72 for points in box.groups()]
+    # CSS has 96 pixels an inch.
+    width, height = (round(96 * n) for n in inches)
+    return Panel(address(out.getvalue(), "webp" if photo else "svg+xml"), alt, width, height)
 
 
 def address(content: bytes, kind: str) -> str:

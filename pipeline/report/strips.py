@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 BUDGET_CHARACTERS = 900_000
 """All pictures of a strip together: the page has 5 MB at most."""
-PLANNED_SHARE = 0.75
-"""Part of the budget that columns like the middle one take: others may need more."""
 MAX_WIDTH_PIXELS, MIN_WIDTH_PIXELS = 400, 140
 """Widths of a column; 400 pixels are twice what it takes on the screen."""
 LEGEND = tuple(zip(canvas.RISK, canvas.CLASS_NAMES, strict=True))
@@ -90,10 +88,12 @@ def panel(picture: Image, alt: str, *, frame: int = -1, quality: int = 82) -> Pa
 
 def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[Panel, ...]:
     """Columns that fit the budget: narrower ones first, then fewer."""
+    # Columns like the middle one take three quarters: others may need more.
+    planned = 0.75 * BUDGET_CHARACTERS
     cost = len(draw(items[len(items) // 2], MAX_WIDTH_PIXELS).uri) / MAX_WIDTH_PIXELS**2
-    step = math.ceil(len(items) * cost * MIN_WIDTH_PIXELS**2 / (PLANNED_SHARE * BUDGET_CHARACTERS))
+    step = math.ceil(len(items) * cost * MIN_WIDTH_PIXELS**2 / planned)
     shown = items[::step]
-    width = min(MAX_WIDTH_PIXELS, int(math.sqrt(PLANNED_SHARE * BUDGET_CHARACTERS / (len(shown) * cost))))
+    width = min(MAX_WIDTH_PIXELS, int(math.sqrt(planned / (len(shown) * cost))))
     panels = [draw(item, width) for item in shown]
     while len(panels) > 1 and sum(len(panel.uri) for panel in panels) > BUDGET_CHARACTERS:
         panels = panels[::2]

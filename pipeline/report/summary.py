@@ -27,7 +27,7 @@ from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
-from rille.stages.terrain.reference import seen_up
+from rille.stages.terrain.reference import camera_height, seen_up
 
 
 def collect(view: RunView) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
     early = [p.screening, *p.contradictions, p.keyframes, p.intrinsics, *p.crosschecks, p.crosscheck, p.agreement]
     truths = (p.accuracy, p.position_accuracy, *p.disparity_accuracy.values())
-    for handle in (*early, p.trajectory, *truths, p.overlap_audit):
+    for handle in (*early, p.trajectory, *truths, p.overlap_audit, *p.ground.values()):
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))
@@ -122,8 +122,8 @@ def given_numbers(view: RunView) -> list[str]:
     """
     trajectory, rig = view.bundle(view.products.trajectory), view.sequence.rig
     levels = [view.bundle(handle) for handle in view.products.level.values()]
-    known = [] if delivery.on_plane(view) else [level.meta for level in levels if level is not None]
-    grounds = [facts["footprint"] for facts in known if facts.get("footprint")]
+    known = [cast(GroundFacts, level.meta) for level in levels if level is not None and not delivery.on_plane(view)]
+    grounds = [box for facts in known if (box := facts.get("footprint"))]
     poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
     poses = poses[rigid.posed(poses)]
     steps = np.einsum("nji,nj->ni", poses[:-1, :, :3], np.diff(poses[:, :, 3], axis=0))
@@ -142,6 +142,9 @@ def given_numbers(view: RunView) -> list[str]:
         far = float(np.median([0.5 * (box[2] + box[3]) for box in grounds]))
         lift = metres(0.01 * left.height / left.fy * far)
         line += f", off by 1 % of the height it lifts or lowers ground {metres(far)} ahead by {lift}"
+    heights = [camera_height(facts) for facts in known if facts.get("plane")]
+    if heights:
+        line += f". By that baseline the left camera stands {metres(float(np.median(heights)))} above the ground"
     return [line + "."]
 
 

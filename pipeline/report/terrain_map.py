@@ -29,8 +29,6 @@ from rille.stages.terrain.shading import slope_deg
 
 MAX_CELLS = 350_000
 """Cells of the map; three pictures of these and the ortho image are about 2 MB in the page."""
-BYTE_STEPS = 254
-"""Steps of a value of one byte; 0 is undefined."""
 
 
 def block(scene: Scene) -> Block | None:
@@ -57,18 +55,18 @@ def data(scene: Scene) -> dict[str, Any] | None:
     z = world.arrays["elevation"][::step, ::step]
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     # Two bytes a height; 0 is undefined.
-    height = _steps(z, low, max(high - low, 1e-9), 65534)
+    height = _steps(z, low, max(high - low, 1e-9), np.uint16)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
     risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
     count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
-    slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, BYTE_STEPS)
+    slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, np.uint8)
     bits = np.asarray(reason, np.uint16)
     return {
         "planes": [
             _picture(height >> 8, height & 255, sigma),
             _picture(np.asarray(risk, np.uint8) | (count << 2), bits >> 8, bits & 255),
-            _picture(_steps(p_hazard, 0.0, 1.0, BYTE_STEPS), slope, np.zeros_like(slope)),
+            _picture(_steps(p_hazard, 0.0, 1.0, np.uint8), slope, np.zeros_like(slope)),
         ],
         "ortho": _ortho(scene, world, step),
         "rows": z.shape[0],
@@ -109,20 +107,21 @@ def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
     return mosaic([(scene.risk.lattice, scene.risk.arrays[name])], missing, scene.world.lattice)
 
 
-def _steps(values: NDArray[Any], low: float, span: float, steps: int) -> NDArray[np.int64]:
-    """1 .. ``steps`` + 1 from ``low`` to ``low + span``, 0 undefined."""
-    whole = 1 + np.rint(np.clip((np.nan_to_num(values, nan=low) - low) / span, 0, 1) * steps).astype(np.int64)
-    return np.where(np.isfinite(values), whole, 0)
+def _steps(values: NDArray[Any], low: float, span: float, kind: type[np.uint8 | np.uint16]) -> NDArray[Any]:
+    """1 to the most that an integer of this kind holds, from ``low`` to ``low + span``; 0 undefined."""
+    share = np.clip((np.nan_to_num(values, nan=low) - low) / span, 0, 1)
+    whole = 1 + np.rint(share * (np.iinfo(kind).max - 1)).astype(kind)
+    return np.where(np.isfinite(values), whole, kind(0))
 
 
-def _ratios(values: Floats) -> tuple[NDArray[np.int64], list[float]]:
+def _ratios(values: Floats) -> tuple[NDArray[Any], list[float]]:
     """Steps of equal ratio of positive values, with the least value and the logarithm of the range."""
     there = values[np.isfinite(values) & (values > 0)]
     if not there.size:
-        return np.zeros(values.shape, np.int64), [1.0, 1.0]
+        return np.zeros(values.shape, np.uint8), [1.0, 1.0]
     low, span = float(there.min()), max(math.log(float(there.max()) / float(there.min())), 1e-9)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _steps(np.log(np.where(values > 0, values, np.nan) / low), 0.0, span, BYTE_STEPS), [low, span]
+        return _steps(np.log(np.where(values > 0, values, np.nan) / low), 0.0, span, np.uint8), [low, span]
 
 
 def _picture(*planes: NDArray[Any]) -> str:

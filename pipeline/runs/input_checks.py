@@ -17,6 +17,7 @@ import numpy as np
 from rille.datasets.protocol import Positions, Rows
 from rille.datasets.text.count import count
 from rille.stages.core.arrays import Floats
+from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between, lengths_along
@@ -24,6 +25,7 @@ from rille.stages.geometry.scale import MAX_ALIKE_SCALE
 from rille.stages.hfvm.given import MAX_REPEATED_SHARE
 from rille.stages.imaging.image_quality import grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
+from rille.stages.terrain.reference import camera_height
 
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
@@ -125,6 +127,8 @@ LIMITS = {
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     ),
+    "distortion": (InputLimit("RIL-681", "misread", most=0),),
+    "ground": (InputLimit("RIL-679", "above", most=0),),
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
         Fault("RIL-673", "turned, degrees", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
@@ -387,6 +391,15 @@ def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given
     return judge("matching", text, figures)
 
 
+def judge_mirror(fitting: Mapping[str, float]) -> Finding | None:
+    """Which image is mirrored: those that make most matches fit once they are, and the share of these."""
+    if not fitting:
+        return None
+    share, which = max(fitting.values()), " or ".join(fitting)
+    text = f"{share:.0%} of the matches of the first pair's images fit the rig once {which}"
+    return judge("images", text, {"mirrored": len(fitting)})
+
+
 def judge_sides(beyond: float) -> Finding:
     """Share of the matches that lie beyond infinity under the given rig."""
     return judge("sides", f"{100 * beyond:.1f} % of the matches lie beyond infinity", {"beyond": beyond})
@@ -412,6 +425,16 @@ def judge_repetition(share: float) -> Finding:
     """Share of the matches that look as well elsewhere, as on rows of plants."""
     text = f"{100 * share:.0f} % of the matches look as well elsewhere on their epipolar lines"
     return judge("repetition", text, {"repeated": share})
+
+
+def judge_ground(facts: GroundFacts) -> Finding:
+    """How high the camera stands above the ground of a pair, or why none is seen: facts of stage ``ground_frame``."""
+    if "warnings" in facts:
+        return judge("ground", facts["warnings"][0], {"above": 1})
+    if facts["plane"] is None or "no_ground" in facts:
+        return judge("ground", facts["no_ground"])
+    stands = f"the left camera stands {camera_height(facts):.3g} m above it, if the baseline is right"
+    return judge("ground", f"{stands}; {facts['ground_share']:.0%} of the matches lie on it")
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:

@@ -98,7 +98,7 @@ class Options(Work):
     progress
         How progress is shown on stderr.
     quiet
-        No progress; warnings and errors only.
+        The same as --progress quiet: warnings and errors only.
     """
 
     keep_going: Annotated[bool, FLAG] = False
@@ -107,6 +107,10 @@ class Options(Work):
     runs: Runs = RUNS
     progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
     quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
+
+    def __post_init__(self) -> None:
+        if self.quiet:
+            object.__setattr__(self, "progress", "quiet")
 
     def part(self) -> str:
         """The options that choose a part of the run, as they are typed; empty: all of it."""

@@ -21,6 +21,7 @@ from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
 from rille.stages.geometry.epipolar import NAMES, corrected, distances, image_turn
 from rille.stages.geometry.geometry import Rig
+from rille.stages.hfvm.given import lines, repeated
 
 
 class OrientationParams(Params):
@@ -91,16 +92,22 @@ def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
         Array("weight", ("match",), "float32", "1", "robust weight in the adjustment, 0 = outlier"),
     ],
 )
-def orientation_stage(params: OrientationParams, disparity: Bundle, *, rig: Rig, pair: int) -> Bundle[OrientationFacts]:
-    """Thinned matches of one pair, and how well they fit the given rig."""
+def orientation_stage(
+    params: OrientationParams, disparity: Bundle, left: Bundle, right: Bundle, *, rig: Rig, pair: int
+) -> Bundle[OrientationFacts]:
+    """Thinned matches of one pair, how well they fit the given rig, and whether its ``left`` and ``right`` images show
+    what repeats."""
     # On planes of textureless regions row displacements were set, not measured.
     usable = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
     rig.check(usable.shape)
-    left, right = thin(
+    places = thin(
         disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
     )
     # rounded to float32, as stage rig will read them
-    points = {"left": left.astype(np.float32), "right": right.astype(np.float32)}
+    points = dict(zip(("left", "right"), (one.astype(np.float32) for one in places), strict=True))
     matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     weight, facts = orient(rig, matches)
+    # A fundamental matrix has seven freedoms.
+    f = lines((matches.left, matches.right)) if len(matches.left) > 7 else None
+    facts["repeated"] = repeated(left["image"], right["image"], (matches.left, matches.right), f)
     return Bundle(points | {"weight": weight.astype(np.float32)}, facts)

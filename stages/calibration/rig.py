@@ -9,13 +9,14 @@ contradict, or would change by too little to matter stays as given, to the last 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
 from pydantic import Field
 
+from rille.stages.calibration.lens_reading import better_reading
 from rille.stages.calibration.parameter_selection import (
     BEYOND_SHARE,
     Decision,
@@ -49,8 +50,10 @@ from rille.stages.geometry.epipolar import (
     standing,
 )
 from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
+from rille.stages.hfvm.given import MAX_REPEATED_SHARE
 from rille.stages.numeric.robust import mad_sigma
 
 
@@ -64,10 +67,13 @@ class RigParams(RelativeParams):
     )
 
 
-def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first: Rig | None = None) -> RigFacts:
+def orient_rig(
+    given: Rig, pairs: Sequence[PointPairs], params: RigParams, first: Rig | None = None, repeated: float = 0.0
+) -> RigFacts:
     """Facts of the rig to be used; without a pair that can be used, only the first six and ``warnings``.
 
-    ``first``: as it was given, where the tracks have corrected its cameras or its yaw since.
+    ``first``: as it was given, where the tracks have corrected its cameras or its yaw since; ``repeated``: share of the
+    matches that look as well elsewhere.
 
     Raises
     ------
@@ -90,7 +96,15 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     if usable:
         turned = first is not None and first.T_right_left.to_list() != given.T_right_left.to_list()
         shown = angle_along(given) if turned else ""
-        facts |= cast(RigFacts, _judged(given, _share(usable), params, shown))
+        repeats = repeated > MAX_REPEATED_SHARE
+        facts |= cast(RigFacts, _judged(given, _share(usable), params, shown, repeats=repeats))
+        if repeats:
+            # Matches that are off by a period contradict a right calibration, or lie beyond infinity.
+            facts["repeats"] = (
+                f"{repeated:.0%} of the matches look as well elsewhere on their epipolar lines: on a pattern that "
+                "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses"
+            )
+            facts["warnings"].insert(0, facts["repeats"])
         if len(usable) < len(pairs):
             few = len(pairs) - len(usable)
             facts["warnings"].insert(0, f"{few} of {len(pairs)} pairs have too few matches for the rig")
@@ -101,25 +115,27 @@ def orient_rig(given: Rig, pairs: Sequence[PointPairs], params: RigParams, first
     return facts
 
 
-def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) -> dict[str, Any]:
-    """What the pairs say on the given rig, and the rig that follows; ``shown``: its angle that tracks tell."""
+def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, *, repeats: bool) -> dict[str, Any]:
+    """What the pairs say on the given rig, and the rig that follows; ``shown``: its angle that tracks tell;
+    ``repeats``: the pairs show what repeats, and repair nothing."""
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
     # 5.0: largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a
     # baseline.
     far = turned or any(abs(math.degrees(p.value)) > 5.0 for p in decision.parameters)
-    applied = params.mode != "fixed" and decision.changed and not far
+    applied = params.mode != "fixed" and decision.changed and not far and not repeats
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
-    if share > BEYOND_SHARE and not turned:
+    if (share > BEYOND_SHARE or far) and not turned:
         left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
         refuse_impossible(rig, left, right, share)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
-    kept = "not repaired, for no mount moves that far" if far else "kept because rig.mode = fixed"
+    kept = "not repaired, for what they show repeats" if repeats else "kept because rig.mode = fixed"
+    kept = "not repaired, for no mount moves that far" if far else kept
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
     hidden = [p for p in decision.parameters if not (p.observed or p.name == shown)]
     warnings = _contradiction(given, median, decision, "repaired" if applied else kept, hidden)
@@ -132,7 +148,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str) 
     bad_rows = right_pixels(given)
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > bad_rows]
     marks |= {"suspects": suspects} if suspects else {}
-    warnings += [] if turned else _doubts(share, after, bad_rows)
+    warnings += [] if turned or repeats else _doubts(share, after, bad_rows)
     # Beside a calibration of other images the differences between pairs say nothing.
     moves = [] if far else _drift(linearised(given, pairs), per_pair, params)
     warnings += [move.warning for move in moves]
@@ -322,7 +338,12 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
 
 @stage("rig", version=3)
 def rig_stage(
-    params: RigParams, orientations: Sequence[Bundle[OrientationFacts]] = (), *, rig: Rig, first: Rig | None = None
+    params: RigParams,
+    orientations: Sequence[Bundle[OrientationFacts]] = (),
+    *,
+    rig: Rig,
+    first: Rig | None = None,
+    lenses: Mapping[str, Any] | None = None,
 ) -> Bundle[RigFacts]:
     """The rig: the given calibration, repaired where the images contradict it."""
     pairs = [
@@ -333,4 +354,11 @@ def rig_stage(
         )
         for found in orientations
     ]
-    return Bundle({}, orient_rig(rig, pairs, params, first))
+    shares = [found.meta["repeated"] for found in orientations]
+    facts = orient_rig(rig, pairs, params, first, float(np.mean(shares)) if shares else 0.0)
+    opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
+    both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened
+    if opened and pairs and (misread := better_reading(rig, both, pairs)):
+        facts["misread"] = misread
+        facts["warnings"].insert(0, misread)
+    return Bundle({}, facts)

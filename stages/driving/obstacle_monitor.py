@@ -34,8 +34,6 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.rigid import posed
 from rille.stages.hazard.vehicle import Vehicle
 
-MODEL_RADIUS_WHEELS = 0.5
-"""A point is compared with the greatest height of the model within this radius [wheel diameters]."""
 LEVEL = 1
 """Pyramid level of the displacements: half the resolution."""
 MIN_RISE_WHEELS, MIN_RISE_SIGMAS = 0.25, 2.0
@@ -211,7 +209,8 @@ def obstacle_monitor_stage(
     camera = Rig.from_dict(inputs.rig.meta["rig"]).left
     wheel = vehicle.wheel_diameter
     lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
-    surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, MODEL_RADIUS_WHEELS * wheel)
+    # A point is compared with the greatest height of the model within half a wheel.
+    surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, 0.5 * wheel)
     poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
     known = posed(poses)
     frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]

@@ -14,11 +14,11 @@ from contextlib import suppress
 import cv2
 import numpy as np
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
-from rille.stages.imaging.features import UNIT_BYTES, match
+from rille.stages.imaging.features import match, root_sift
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, fix
 from rille.stages.terrain.relief.grid import Grid
 
@@ -98,7 +98,7 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
     return np.column_stack([motion[:, :2], motion[:, 2] + b - motion[:, :2] @ a]), used.ravel() != 0
 
 
-def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
+def _described(image: Grid, other: float) -> tuple[Floats, Floats32]:
     """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
     while other > 1.5 * image.cell:
         image = image.halved()
@@ -112,9 +112,5 @@ def _described(image: Grid, other: float) -> tuple[Floats, AnyArray]:
     grey = np.where(known > 0, grey, around[0] / np.maximum(around[1], 1e-6))
     # Without it keypoints lie a part of a cell off their places.
     sift = cv2.SIFT.create(8000, enable_precise_upscale=True)
-    points, descriptors = sift.detectAndCompute(np.clip(grey, 0, 255).astype(np.uint8), known.astype(np.uint8))
-    if descriptors is None:
-        return np.empty((0, 2)), np.empty((0, 128), np.float32)
-    at = np.array([point.pt for point in points])
-    root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
-    return at @ matrix[:, :2].T + matrix[:, 2], (UNIT_BYTES * root).astype(np.float32)
+    at, _, descriptors = root_sift(sift, np.clip(grey, 0, 255).astype(np.uint8), known.astype(np.uint8))
+    return at @ matrix[:, :2].T + matrix[:, 2], descriptors.astype(np.float32)

@@ -28,6 +28,8 @@ class OrientationFacts(Facts):
     """RMS of inliers, and with the right camera turned as they ask for."""
     turn_deg: NotRequired[float]
     """Of the right image in its plane against the given rig, clockwise as one sees it."""
+    repeated: NotRequired[float]
+    """Share of the matches that look as well elsewhere on their epipolar lines."""
 
 
 class RigFacts(Facts):
@@ -51,8 +53,12 @@ class RigFacts(Facts):
     matches: NotRequired[int]
     suspects: NotRequired[list[int]]
     """Pairs whose rows the rig does not explain."""
+    repeats: NotRequired[str]
+    """What the images show repeats, so that matches may be off by a period."""
     contradiction: NotRequired[str]
     """A correction that no mount makes."""
+    misread: NotRequired[str]
+    """By which reading of the lenses' coefficients the matches fit better."""
     knocked: NotRequired[str]
     """A rig that one calibration does not describe."""
 
@@ -67,13 +73,11 @@ class SwapFacts(Facts):
     exchanged: NotRequired[float]
 
 
-class RepetitionFacts(Facts):
-    """Whether the scene repeats."""
+class MirrorFacts(Facts):
+    """Whether a pair fits its rig once an image is mirrored."""
 
-    repeated: float
-    """Share of the matches that look as well elsewhere on their epipolar lines."""
-    contradiction: NotRequired[str]
-    warnings: NotRequired[list[str]]
+    fitting: dict[str, float]
+    """Which image and which way, in words, and the share of the matches that fit then; of more than half."""
 
 
 class SynchronyFacts(Facts):

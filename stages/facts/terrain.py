@@ -37,6 +37,7 @@ class GroundFacts(Facts):
     """Normal, in the left camera's frame, of a plane that most pixels lie on and that is no ground by its attitude."""
     why: NotRequired[str]
     """The reference is a plane that is no ground, though none was asked for."""
+    warnings: NotRequired[list[str]]
     seen_up: NotRequired[list[float]]
     """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
 

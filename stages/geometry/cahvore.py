@@ -20,6 +20,7 @@ calibration including fish-eye lenses, doi:10.1007/s11263-006-5168-1; Di, Li (20
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +28,6 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 
 Vector = tuple[float, float, float]
-
-MAX_NEWTON_STEPS = 30
-"""Newton steps; they double the digits from a start that is right to some percent."""
-
-SOLVED_RAD = 1e-14
-"""Radians, and shares of a radius, at which Newton's method ends."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +85,14 @@ class Bending:
         if not any(self.pupil):
             return angle
         _, e1, e2 = self.pupil
-        for _ in range(MAX_NEWTON_STEPS):
+
+        def step(angle: Floats) -> Floats:
             sine, cosine, shift = np.sin(angle), np.cos(angle), _even(self.pupil, angle)
             slope = 2.0 * e1 * angle + 4.0 * e2 * angle**3
             miss = along * sine - far * cosine - (angle - sine) * shift
-            step = miss / (along * cosine + far * sine - (1.0 - cosine) * shift - (angle - sine) * slope)
-            angle = angle - step
-            if not (np.abs(step) > SOLVED_RAD).any():
-                break
-        return angle
+            return np.asarray(miss / (along * cosine + far * sine - (1.0 - cosine) * shift - (angle - sine) * slope))
+
+        return _newton(step, angle)
 
     def _chi(self, angle: Floats) -> Floats:
         t = np.where(angle < self.reach(), angle, np.nan)
@@ -118,15 +112,27 @@ class Bending:
         if not any(self.radial):
             return bent
         r0, r1, r2 = self.radial
-        chi = bent / (1.0 + r0)
-        for _ in range(MAX_NEWTON_STEPS):
+
+        def step(chi: Floats) -> Floats:
             square = chi * chi
-            step = ((1.0 + _even(self.radial, chi)) * chi - bent) / (1 + r0 + 3 * r1 * square + 5 * r2 * square**2)
-            chi = chi - step
-            if not (np.abs(step) > SOLVED_RAD * np.maximum(1.0, np.abs(chi))).any():
-                break
+            slope = 1 + r0 + 3 * r1 * square + 5 * r2 * square**2
+            return np.asarray(((1.0 + _even(self.radial, chi)) * chi - bent) / slope)
+
+        chi = _newton(step, bent / (1.0 + r0))
         solved = np.abs((1.0 + _even(self.radial, chi)) * chi - bent) < 1e-12 * np.maximum(1.0, bent)
         return np.where(solved & (chi >= 0), chi, np.nan)
+
+
+def _newton(step: Callable[[Floats], Floats], start: Floats) -> Floats:
+    """The zero by Newton's ``step``; each doubles the digits of a start that is right to some percent."""
+    x = start
+    for _ in range(30):
+        off = step(x)
+        x = x - off
+        # Radians, or shares of a radius.
+        if not (np.abs(off) > 1e-14 * np.maximum(1.0, np.abs(x))).any():
+            break
+    return x
 
 
 def _even(terms: Vector, x: Floats) -> Floats:

@@ -30,9 +30,6 @@ MAX_LINE_DISTANCE_PX = 2.0
 """A match this near its epipolar line lies on it. Of two images of a street that are one frame apart .22 to .32 of the
 matches do so, of simultaneous ones .95 to .98; on a desert up to .08, and .99."""
 
-DIFFERENCE_STEP_RAD = 1e-6
-"""Radians: step of the central differences of depth."""
-
 
 def standing(rig: Rig) -> bool:
     """Whether one camera stands above the other: epipolar lines run down the image then, and not along its rows."""
@@ -129,11 +126,11 @@ def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
     rho, per_pixel = inverse_depth(rig, left, right - left)
     slopes = np.empty((len(left), 5))
     for i in range(5):
-        step = np.zeros(5)
-        step[i] = DIFFERENCE_STEP_RAD
+        # Central differences over a microradian.
+        step = 1e-6 * np.eye(5)[i]
         ahead, _ = inverse_depth(corrected(rig, step), left, right - left)
         behind, _ = inverse_depth(corrected(rig, -step), left, right - left)
-        slopes[:, i] = (ahead - behind) / (2 * DIFFERENCE_STEP_RAD)
+        slopes[:, i] = (ahead - behind) / (2 * step[i])
     # In pixels of disparity, which stereo measures alike near and far.
     scaled = slopes / per_pixel[:, None]
     weighted = np.einsum("ni,nj->ij", scaled, scaled)

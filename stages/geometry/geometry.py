@@ -248,22 +248,24 @@ def orthonormal(matrix: ArrayLike) -> Floats:
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
 
-NADIR_DEG = 10.0
-"""Tilt up to which a camera counts as looking straight down (or up), so that its axis has no heading."""
-
-
 def level_rotation(up_in_camera: ArrayLike) -> Floats:
-    """Rotation R_level_cam of the levelled frame: z up, y the horizontal projection of the optical axis, x right.
+    """Rotation R_level_cam of the levelled frame: z up, y ahead, x right.
+
+    Ahead is the horizontal projection of the optical axis. Of a camera within 10 degrees of straight down, whose axis
+    points to where a mount or a gust tilts it, it is that of the image's upper edge (straight up: the lower one). From
+    10 to 30 degrees the one passes into the other, so that no heading jumps.
 
     Parameters
     ----------
-    up_in_camera : (3,) direction of "up" in the optical camera frame; within :data:`NADIR_DEG` of the optical axis, of
-        which the horizontal projection then is where a mount or a gust tilts it, the top of the image lies ahead.
+    up_in_camera : (3,) direction of "up" in the optical camera frame.
     """
     z = np.asarray(up_in_camera, dtype=np.float64)
     z = z / np.linalg.norm(z)
-    aside = math.sin(math.radians(NADIR_DEG))
-    forward = np.array([0.0, 0.0, 1.0] if float(np.hypot(z[0], z[1])) >= aside else [0.0, -1.0, 0.0])
+    # Length of the axis' horizontal projection; the edge's weight is as long, so that the turn from one to the other is
+    # even.
+    aside = float(np.hypot(z[0], z[1]))
+    axis = float(np.interp(math.degrees(math.asin(min(aside, 1.0))), (10.0, 30.0), (0.0, 1.0)))
+    forward = np.array([0.0, math.copysign((1.0 - axis) * max(aside, 0.1), z[2]), axis])
     y = forward - z * float(z @ forward)
     y = y / float(np.linalg.norm(y))
     return np.array([np.cross(y, z), y, z], dtype=np.float64)

@@ -41,9 +41,6 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
 }
 """How many coefficients each model takes."""
 
-MIN_FOCAL_SHARE = 0.7
-"""A fisheye's ideal camera keeps at least this share of its focal length, so half of the pixels at the centre."""
-
 CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
 
@@ -82,7 +79,8 @@ class Lens:
 
         It has the raw focal length, so that the centre keeps its resolution, except for a fisheye: there the pinhole's
         edges are far inside the raw image, and the focal length is shortened until the middle of each raw edge is seen,
-        but no further than to :data:`MIN_FOCAL_SHARE`. What lies beyond (more than 60 degrees off the axis) is lost.
+        but no further than to .7, so that half of the pixels at the centre stay. What lies beyond (more than 60 degrees
+        off the axis) is lost.
         """
         c = self.camera
         if self.model != "fisheye" and not (self.model == "cahvore" and self._bending.linearity < 1):
@@ -93,7 +91,7 @@ class Lens:
         room = np.array([c.cx, w - c.cx, c.cy, h - c.cy])
         # an edge without ideal position is 90 degrees off the axis or more
         ratio = np.where(np.isfinite(far), room / np.maximum(far, 1e-9), 0.0)
-        factor = float(np.clip(ratio.min(), MIN_FOCAL_SHARE, 1.0))
+        factor = float(np.clip(ratio.min(), 0.7, 1.0))
         return replace(c, fx=factor * c.fx, fy=factor * c.fy)
 
     @cached_property

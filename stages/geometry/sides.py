@@ -34,11 +34,17 @@ def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float
 
 
 def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
-    """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig with its sides exchanged.
+    """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig mirrored or with its sides swapped.
 
-    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines.
+    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines. Images of both
+    that are mirrored top to bottom show on lines, too, unless baseline and axes lie in one plane.
     """
     swapped, as_given, other_way = exchanged(rig, left, right)
+    both = (rig.left, left), (rig.right, right)
+    back = [points * [1.0, -1.0] + [0.0, camera.height - 1.0] for camera, points in both]
+    if max(as_given, other_way) < 0.4 and fits(rig, back[0], back[1]) > 0.8:
+        text = "the matches fit the rig only once the images of both cameras are mirrored top to bottom"
+        raise DegenerateError("RIL-684", text, remedy="mirror them back")
     if swapped:
         raise DegenerateError(
             "RIL-781",

@@ -33,9 +33,6 @@ from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
-MAX_DISPLACEMENT_PX = 16000
-"""Pixels: displacements of a level are 16-bit and doubled from level to level."""
-
 
 @dataclass(frozen=True)
 class PriorDisparities:
@@ -70,8 +67,8 @@ def known_beforehand(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, 
 
 
 def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
-    # NaN is not less, and so unknown as well.
-    known = (np.abs(u) < MAX_DISPLACEMENT_PX) & (np.abs(v) < MAX_DISPLACEMENT_PX)
+    # Displacements of a level are 16-bit and doubled from level to level. NaN is not less, and so unknown as well.
+    known = np.maximum(np.abs(u), np.abs(v)) < 16000
     return PriorDisparities(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
 
 

@@ -27,9 +27,6 @@ Matrix = NDArray[np.float64]
 
 NO_BAND: Matrix = np.zeros((3, 3))
 
-MATCH_SIGMA_PX = 0.5
-"""Pixels: deviation of an integer match from its line."""
-
 TERM_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.5])
 """Deviations of the eight free terms (x', x'x, x'y, y'x, y'y, x, y, 1) in half image sides."""
 
@@ -63,11 +60,13 @@ def fit_points(
     right_mid = (0.5 * (right_shape[1] - 1), 0.5 * (right_shape[0] - 1))
     p = np.stack([(x - left_mid[0]) / scale, (y - left_mid[1]) / scale])
     q = np.stack([(x + u - right_mid[0]) / scale, (y + v - right_mid[1]) / scale])
-    f, cost, spread = _solve(p, q, MATCH_SIGMA_PX / scale)
+    # Deviation of an integer match from its line: half a pixel.
+    sigma = 0.5 / scale
+    f, cost, spread = _solve(p, q, sigma)
     # 0.05 pixels: median distance of matches from lines along the rows beyond which lines along the columns may be
     # likelier. A plane lies on lines of either kind; relief of less than half a pixel tells them apart.
     if spread * scale > 0.05:
-        cols = _solve(p[::-1], q[::-1], MATCH_SIGMA_PX / scale)
+        cols = _solve(p[::-1], q[::-1], sigma)
         if cols[1] < cost:
             f, spread = transposed(cols[0]), cols[2]
     to_left, to_right = (

@@ -142,9 +142,6 @@ TAPS = np.array(
 DEVIATION = 6
 """Number of the feature that is the local standard deviation."""
 
-VARIANCE_RADIUS_PX = 2
-"""Pixels; the paper gives no window for the variance, 5 x 5 is our choice."""
-
 
 def planes(image: AnyArray) -> Planes:
     """Features of Table 1, each divided by its normalisation.
@@ -179,8 +176,9 @@ def row_of_features(rows, taps, out):  # type: ignore[no-untyped-def]
         source = rows[np.int64(taps[t, 1])][np.int64(taps[t, 2]) :]
         for x in range(cols):
             target[x] += factor * source[x]
-    width, size = 2 * VARIANCE_RADIUS_PX + 1, np.float32((2 * VARIANCE_RADIUS_PX + 1) ** 2)
-    first = RADIUS_PX - VARIANCE_RADIUS_PX
+    # The paper gives no window for the variance; 5 x 5 pixels are our choice.
+    width, size = 5, np.float32(25.0)
+    first = RADIUS_PX - width // 2
     sums, squares = np.zeros(cols + width - 1, np.float32), np.zeros(cols + width - 1, np.float32)
     for k in range(first, first + width):
         source = rows[k][first:]
@@ -296,11 +294,6 @@ def _compact(framed, words):  # type: ignore[no-untyped-def]
 Grey = tuple[AnyArray, AnyArray]
 """Grey values (row, col) float32, of masked pixels from the next valid level above, and mask uint8, 1 = usable."""
 
-NOISE_VARIANCE_RATIO = 2.5
-"""The variance of nine pixels of white noise reaches 2.5 times its expectation in one of two hundred places; all others
-are averaged alike. A texture of random dots, which looks like noise, then still matches where it is shifted by a
-fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from 1 to 2.5."""
-
 
 @dataclass(frozen=True)
 class Layer:
@@ -414,13 +407,17 @@ def lee(image: AnyArray, noise: float) -> Floats32:
 
     With mean m and variance s^2 of the 3 x 3 pixels around it and noise of standard deviation n, a grey value a becomes
 
-        m + max(0, 1 - NOISE_VARIANCE_RATIO n^2 / s^2) (a - m)
+        m + max(0, 1 - 2.5 n^2 / s^2) (a - m)
 
     (J.-S. Lee (1980), Digital image enhancement and noise filtering by use of local statistics, IEEE Transactions on
-    Pattern Analysis and Machine Intelligence 2, 165-168; there NOISE_VARIANCE_RATIO is 1.)
+    Pattern Analysis and Machine Intelligence 2, 165-168; there 2.5 is 1.)
     """
     out = np.empty(image.shape, np.float32)
-    _lee(np.pad(image, 1, mode="edge"), np.float32(NOISE_VARIANCE_RATIO * noise * noise), out)
+    # The variance of nine pixels of white noise reaches 2.5 times its expectation in one of two hundred places; all
+    # others are averaged alike. A texture of random dots, which looks like noise, then still matches where it is
+    # shifted by a fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from
+    # 1 to 2.5.
+    _lee(np.pad(image, 1, mode="edge"), np.float32(2.5 * noise * noise), out)
     return out
 
 

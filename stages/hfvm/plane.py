@@ -22,11 +22,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.cubic import cubic
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm.epipolar import typical
 from rille.stages.hfvm.image import Grey, Image, Layer, Shape, Window
+from rille.stages.imaging.features import match, root_sift
 from rille.stages.imaging.pyramid import filled_from
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -47,17 +49,12 @@ KERNEL_REACH_PX = 2
 """Pixels that the cubic kernel reaches beyond a place."""
 
 
-PLANE_TOLERANCE_PX = 1.0
-"""Pixels of the coarse level: a match within twice this belongs to the plane; at this distance it has a quarter of the
-weight."""
-
-
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
     """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
 
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
-    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    fit = fit_points(sample, shapes[level])
     # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
     # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
     if fit is None or fit[1] < (0.5 if few else 0.6):
@@ -72,7 +69,7 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
 
 def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
     """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
-    fit = fit_points(sample, shapes[level], PLANE_TOLERANCE_PX)
+    fit = fit_points(sample, shapes[level])
     return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
 
 
@@ -157,13 +154,12 @@ def translation(x: float, y: float | None = None) -> Matrix:
     return np.array([[1.0, 0.0, x], [0.0, 1.0, x if y is None else y], [0.0, 0.0, 1.0]])
 
 
-def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, float] | None:
-    """Homography of the dominant plane, and the share of matches within twice ``tolerance`` of it; None: too few.
+def fit_points(sample: Sample, shape: Shape) -> tuple[Matrix, float] | None:
+    """Homography of the dominant plane, and the share of matches within two pixels of it; None: too few.
 
     Parameters
     ----------
     sample : matches of one level, which has ``shape``.
-    tolerance : pixels; a match this far from the plane has a quarter of the weight.
 
     Returns
     -------
@@ -178,8 +174,9 @@ def fit_points(sample: Sample, shape: Shape, tolerance: float) -> tuple[Matrix, 
     to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
     p = np.stack([x / scale - middle[0], y / scale - middle[1]])
     d = np.stack([u, v]).astype(np.float64) / scale
-    unit, error = _solve(p, d, tolerance / scale)
-    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2 * tolerance / scale))
+    # A match a pixel of the level off the plane has a quarter of the weight.
+    unit, error = _solve(p, d, 1.0 / scale)
+    return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2.0 / scale))
 
 
 def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray]:
@@ -265,9 +262,6 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
                 out_valid[y, x] = 1
 
 
-MAX_SIDE_PX = 1024
-"""Pixels: keypoints are looked for at the finest level whose longer side is at most this."""
-
 MIN_AGREEING = 15
 """Keypoints that must agree; in unrelated images and under other suns 6 do."""
 
@@ -275,8 +269,8 @@ MIN_AGREEING = 15
 def find_turn(left: Image, right: Image) -> Matrix | None:
     """Homography from left to right pixels (level 0) on which enough keypoints agree, or None."""
     levels = [_level(view) for view in (left, right)]
-    (p, a), (q, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
-    first, second = _alike(a, b)
+    (p, _, a), (q, _, b) = (_keypoints(view, level) for view, level in zip((left, right), levels, strict=True))
+    first, second = match(a.astype(np.float32), b.astype(np.float32)).T
     if len(first) < MIN_AGREEING:
         return None
     # What relief does to a keypoint's place on the dominant surface.
@@ -290,35 +284,18 @@ def find_turn(left: Image, right: Image) -> Matrix | None:
 
 
 def _level(view: Image) -> int:
-    """Finest level whose longer side is at most :data:`MAX_SIDE_PX`, else the coarsest."""
-    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= MAX_SIDE_PX), len(view.shapes) - 1)
+    """Finest level whose longer side is at most 1024 pixels, else the coarsest: keypoints are looked for there."""
+    return next((n for n, shape in enumerate(view.shapes) if max(shape) <= 1024), len(view.shapes) - 1)
 
 
-def _keypoints(view: Image, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Columns and rows (n, 2) of keypoints, pixels of the level, and their descriptors (n, 128) of length one."""
+def _keypoints(view: Image, level: int) -> tuple[Floats, Floats, Bytes]:
+    """Keypoints of a level: columns and rows, pixels of the level, sizes, and descriptors (:func:`root_sift`)."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
     # Comparing all keypoints with all takes their number squared.
     # 0.02: least contrast of a keypoint; half of OpenCV's default, for sand and haze.
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)  # type: ignore[attr-defined]  # not in the stubs
-    points, histograms = sift.detectAndCompute(grey, (layer.valid != 0).astype(np.uint8))
-    if not points:
-        return np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
-    total = np.maximum(histograms.sum(axis=1, keepdims=True), 1e-9)
-    # Roots of shares have length one, and their Euclidean distance is Hellinger's between the histograms.
-    return np.array([point.pt for point in points], np.float32), np.sqrt(histograms / total)
-
-
-def _alike(a: AnyArray, b: AnyArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of descriptors (n, 128) of which each is the other's nearest, by far."""
-    if len(a) < 2 or len(b) < 2:
-        return np.empty(0, np.intp), np.empty(0, np.intp)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = [m.trainIdx for (m,) in matcher.knnMatch(b, a, k=1)]
-    near = matcher.knnMatch(a, b, k=2)
-    # Lowe's (2004): the nearest keypoint is nearer by this factor than the second nearest.
-    kept = [m for m, n in near if m.distance < 0.8 * n.distance and back[m.trainIdx] == m.queryIdx]
-    return np.array([m.queryIdx for m in kept], np.intp), np.array([m.trainIdx for m in kept], np.intp)
+    sift = cv2.SIFT.create(nfeatures=4000, contrastThreshold=0.02)
+    return root_sift(sift, grey, (layer.valid != 0).astype(np.uint8))
 
 
 def _upright(h: Matrix, shape: Shape) -> bool:

@@ -68,9 +68,6 @@ Frame = Callable[[AnyArray, AnyArray], Maps]
 WINDOW_RADIUS_PX = 2
 """Pixels: the windows are 5 x 5; larger ones have less noise, and smooth small relief away."""
 
-ASSUMED_NOISE_VARIANCE = 8.0
-"""Assumed noise, squared grey levels per pixel: it shortens steps where texture is weak."""
-
 MAX_CORRECTION_PX = 1.5
 """Pixels: a correction beyond this is a jump to something else."""
 
@@ -226,7 +223,8 @@ def _products(images, now, axes, keep, y, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _solve_windows(sums, keep, out, upright):  # type: ignore[no-untyped-def]
     """Steps of a row from the sums (10, col) over each pixel's window."""
-    noise, least = np.float32(ASSUMED_NOISE_VARIANCE), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
+    # Assumed noise, 8 squared grey levels a pixel, shortens steps where texture is weak.
+    noise, least = np.float32(8.0), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
     one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
     for x in range(keep.size):
         n = max(sums[0, x], one)
@@ -322,9 +320,6 @@ BEND_STIFFNESS = 2000.0
 MAX_BEND_PX = 0.05
 """Second difference, pixels, beyond which the stiffness gives way to an edge."""
 
-RELIEF_STEPS = 4
-"""Four steps instead of seven: the median error of the judged half is .165 px instead of .160."""
-
 
 def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
     """Displacements of the relief that fits best.
@@ -345,8 +340,8 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
     lines, trust = _lines(u, v, keep, images.spline.shape)
     # 1000.0 squared grey levels for a pixel off the line: more than the strongest texture says.
     holds = lines * np.float32(np.sqrt(1000.0 * trust))
-    for step in range(RELIEF_STEPS):
-        soft = step < RELIEF_STEPS // 2
+    # Four steps instead of seven: the median error of the judged half is .165 px instead of .160.
+    for soft in (True, True, False, False):
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
         grey = _grey(images, u, v, keep)
         stiff, normal = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
@@ -496,8 +491,6 @@ BLANK_STD_PX = 0.2
 # The relief of preset ``accurate`` errs less: its standard deviations are too great.
 FLOOR_PX = 0.13
 NOISE_FACTOR = 0.41
-RELIEF_FACTOR = 1.71
-BORDER_PX = 0.80
 
 
 def standard_deviation(noise: AnyArray, disparity: AnyArray, keep: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -515,7 +508,7 @@ def standard_deviation(noise: AnyArray, disparity: AnyArray, keep: NDArray[np.bo
     """
     relief, border = neighbours(disparity, keep)
     variance = np.float32(FLOOR_PX**2) + np.float32(NOISE_FACTOR**2) * noise
-    variance += np.float32(RELIEF_FACTOR**2) * relief + np.float32(BORDER_PX**2) * border
+    variance += np.float32(1.71**2) * relief + np.float32(0.80**2) * border
     return np.where(keep, np.sqrt(variance), np.float32(np.nan))
 
 

@@ -49,9 +49,6 @@ WINDOW_RADIUS_PX = 6
 WINDOW_SIDE_PX = 2 * WINDOW_RADIUS_PX + 1
 """Side of the window, pixels."""
 
-MAX_DISTANCE = 60
-"""Greatest distance of two features [byte steps]: about three times that of noise."""
-
 MIN_DISTINCT_STEPS = 2
 """Steps from the best one to those that it must be distinct from."""
 
@@ -156,7 +153,8 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
                 j, i = _end(region, y, x, at[y, x])
                 outside[y, x] = i < 0 or i >= cols or j < 0 or j >= rows or not region.valid[j, i]
                 if not outside[y, x]:
-                    cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), MAX_DISTANCE)
+                    # At most about three times the distance [byte steps] of noise.
+                    cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), 60)
 
 
 @njit(cache=True, nogil=True)

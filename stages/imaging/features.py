@@ -1,4 +1,4 @@
-"""SIFT features of an image, for the crosscheck and for places seen again, and which of two images match.
+"""SIFT features of an image, and which of two images match: for all that compares images without a start.
 
 Keypoints and descriptors are OpenCV's (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94); the square root of the
 descriptors' L1-normalised values as bytes is that of COLMAP (Arandjelovic and Zisserman 2012,
@@ -64,16 +64,24 @@ def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
     # COLMAP's contrast of a keypoint, as OpenCV counts. OpenCV's own scale of the first octave, 1.6 px of a doubled
     # image, finds fewer of the small features, which are the most exact: errors on the short mockup are a third larger.
     sift = cv2.SIFT.create(MAX_FEATURES, 3, 0.02, sigma=1.3, enable_precise_upscale=True)
-    keypoints, values = sift.detectAndCompute(grey, None)
-    if not keypoints:
-        return Bundle({"points": np.zeros((0, 2), np.float32), "descriptors": np.zeros((0, 128), np.uint8)}, {})
-    points = (halving * np.array([k.pt for k in keypoints]) + PIXEL_CENTRE) * factor
+    found, sizes, descriptors = root_sift(sift, grey)
+    points = (halving * found + PIXEL_CENTRE) * factor
     # Their size is the diameter, two scales.
-    scale = 0.5 * halving * factor[0] * np.array([k.size for k in keypoints])
-    keep = _away_from_mask(points, scale, valid)
+    keep = _away_from_mask(points, 0.5 * halving * factor[0] * sizes, valid)
+    return Bundle({"points": points[keep].astype(np.float32), "descriptors": descriptors[keep]}, {})
+
+
+def root_sift(sift: cv2.SIFT, grey: Bytes, valid: Bytes | None = None) -> tuple[Floats, Floats, Bytes]:
+    """Points (n, 2) column, row of an image (row, col), their sizes (n,), pixels, and descriptors (n, 128).
+
+    ``valid`` (row, col): points are where it is not 0; None: anywhere.
+    """
+    keypoints, values = sift.detectAndCompute(grey, valid)
+    if not keypoints:
+        return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.uint8)
     unit = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1.0))
     descriptors = np.minimum(np.rint(UNIT_BYTES * unit), 255).astype(np.uint8)
-    return Bundle({"points": points[keep].astype(np.float32), "descriptors": descriptors[keep]}, {})
+    return np.array([k.pt for k in keypoints]), np.array([k.size for k in keypoints]), descriptors
 
 
 def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools:

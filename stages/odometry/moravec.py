@@ -53,17 +53,15 @@ def interest_points(
     count: int,
     *,
     noise: float,
-    border: int,
     occupied: NDArray[np.floating] | None = None,
 ) -> Floats32:
     """Find at most ``count`` interest points, the strongest of each bucket first.
 
     Parameters
     ----------
-    image, valid : (rows, cols) grey 0..255 and mask, 1 usable; no point within ``border`` pixels of an unusable one.
+    image, valid : (rows, cols) grey 0..255 and mask, 1 usable; no point within 8 pixels of an unusable one.
     count : points wanted; also about the number of buckets.
     noise : grey levels; a point must exceed three times what noise of this standard deviation alone gives.
-    border : pixels kept free of points, so that the templates of matching lie inside.
     occupied : (n, 2) column, row of points that already hold their bucket; only empty buckets get new ones.
 
     Returns
@@ -74,7 +72,8 @@ def interest_points(
     # The expected sum of squared differences of pure noise is 2 sigma^2 for each of the 25 pixels.
     # Three times the expectation: the threshold is on a variance, so contrast must be 1.7 times the noise.
     rows, cols = _peaks(response, 3.0 * 2.0 * SIDE**2 * noise**2)
-    inner = clear_of_mask(valid, np.stack([cols, rows], axis=-1), border)
+    # 8 pixels from the image's edge and its mask: template, cubic interpolation and a step of the alignment.
+    inner = clear_of_mask(valid, np.stack([cols, rows], axis=-1), 8)
     rows, cols = rows[inner], cols[inner]
     side = max(math.sqrt(image.shape[0] * image.shape[1] / max(count, 1)), 1.0)
     across = math.ceil(image.shape[1] / side)

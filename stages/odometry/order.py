@@ -6,9 +6,6 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 
-JUMP = 3.0
-"""Median steps from one frame to the next, from which on a step is a jump; half of it joins two frames."""
-
 
 def without_jumps(places: Floats) -> list[tuple[int, int]]:
     """First and last row, of places (n, 3), of the runs of rows that follow each other without a jump, in that order.
@@ -17,7 +14,8 @@ def without_jumps(places: Floats) -> list[tuple[int, int]]:
     camera that comes back may make, or where another order has jumps, too. The first run stays the first.
     """
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    jump = JUMP * float(np.median(steps)) if steps.size else 0.0
+    # Three median steps are a jump; half of it joins two runs.
+    jump = 3.0 * float(np.median(steps)) if steps.size else 0.0
     ends = np.flatnonzero(steps > jump)
     if not 2 <= len(ends) <= len(places) // 3:
         return []

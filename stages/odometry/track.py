@@ -33,10 +33,6 @@ from rille.stages.odometry.displacements import NEIGHBOURS, Motion, fit_affinity
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.sharpness import equally_sharp
 
-BORDER = 8
-"""Pixels between an interest point and the image's edge: template, cubic interpolation and a step of the alignment."""
-
-
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
 
@@ -88,7 +84,7 @@ def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackPar
     motions : displacements from each frame to the next, one fewer than frames.
     """
     first = frames[0]
-    seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise, border=BORDER)
+    seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise)
     state = Tracks.born(seeds.astype(np.float64), 0, len(frames))
     for j, motion in enumerate(motions, start=1):
         _advance(state, frames, motion, j, params)
@@ -117,7 +113,7 @@ def _reseed(state: Tracks, frames: Sequence[Pyramid], j: int, params: TrackParam
     alive = known(state.points[:, j]) & known(state.points[:, 0])
     here, there = state.points[alive, j], state.points[alive, 0]
     seeds = interest_points(
-        frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, border=BORDER, occupied=here
+        frames[j].images[0], frames[j].valid[0], params.points, noise=params.noise, occupied=here
     ).astype(np.float64)
     # Fewer tracks do not determine the affinity back to the key frame.
     if len(seeds) == 0 or len(here) < NEIGHBOURS:

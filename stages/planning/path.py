@@ -18,7 +18,8 @@ where the elevation model is narrower than the vehicle, as beside the cameras; t
 
 An elevation model is fan-shaped and ragged: the first and last rows with a free cell hold a few, which may lead
 nowhere. So a start that is not given is, of the free cells within one vehicle length of the first row that lead on, the
-one nearest to that row's middle; the target likewise at the last row.
+one nearest to that row's middle; the target likewise at the last row. Over a map that reaches far behind the place
+where the rig began, as after an orbit, the start is the cell nearest to that place, on connected ground over most rows.
 
 Where no path by rows comes within one vehicle length of the last row, ``auto`` goes, in any direction, as far as
 connected ground leads from the first rows: that is a path if it leads at least one vehicle length ahead, and
@@ -30,7 +31,7 @@ crossed, and the length left out is reported (``left_out_m``).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -193,6 +194,7 @@ def find_path(
     ends: Ends = (None, None),
     stretch: bool = False,
     params: PathParams | None = None,
+    begin: Sequence[float] | None = None,
 ) -> Route:
     """Path over a risk map.
 
@@ -202,6 +204,7 @@ def find_path(
     ends : start and target, x, y, metres; None: see the module. Those of ``params`` are not looked at.
     stretch : where rows do not cross the map, cross the connected ground over most rows, wherever it begins; else go
         from the first rows as far as connected ground leads.
+    begin : x, y, metres, where the rig began.
 
     Raises
     ------
@@ -217,7 +220,10 @@ def find_path(
             _check_end(maps, lattice, vehicle, name, point)
     start, target = (None if point is None else cell_of(lattice, point) for point in ends)
     cells, limit = (start, target), params.p_certain_hazard
-    route = _route(PathMaps(maps, lattice, vehicle, params), vehicle, cells, stretch, params)
+    ground = PathMaps(maps, lattice, vehicle, params)
+    if start is None and begin is not None:
+        cells = (_begun(ground, vehicle, cell_of(lattice, begin)), target)
+    route = _route(ground, vehicle, cells, stretch, params)
     if len(route.cells):
         return replace(route, ended_by=GOAL if ends[1] is not None else ending(route, maps, lattice, vehicle, limit))
     # A limit that closed nothing cannot be the reason.
@@ -235,6 +241,18 @@ def find_path(
         f"leads over ground of up to {chance:.3g}: raise path.p_certain_hazard to that to take it"
     )
     return replace(route, reason=reason)
+
+
+def _begun(ground: PathMaps, vehicle: Vehicle, begin: Cell) -> Cell | None:
+    """The cell nearest to where the rig began, of the connected ground over most rows; None where the map reaches no
+    vehicle's length behind that place, or no farther ahead."""
+    length = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell)
+    far, near = row_span(~ground.closed)
+    free = np.argwhere(max((ground.connected(below, 0, None) for below in GROUNDS), key=lambda part: part[1])[0])
+    if not len(free) or begin[0] >= near - length:
+        return None
+    row, col = (int(k) for k in free[np.argmin(((free - begin) ** 2).sum(axis=1))])
+    return (row, col) if row > far + length else None
 
 
 def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, params: PathParams) -> Route:
@@ -344,12 +362,14 @@ def nearest_middle(cells: Bools, row: int) -> Cell:
     outputs=[Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel")],
     memory=Memory(factor=6.0, lower=("locus.cell_size",)),
 )
-def path_stage(params: PathParams, risk: Bundle[RiskFacts], *, use: str | None = None) -> Bundle[PathFacts]:
+def path_stage(
+    params: PathParams, risk: Bundle[RiskFacts], *, use: str | None = None, begin: Sequence[float] | None = None
+) -> Bundle[PathFacts]:
     """Path of least height differences for a vehicle with a width: monotone in the rows, or any direction."""
     lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
     local = use == "local"
     maps = {name: np.asarray(risk[name]) for name in risk.arrays}
     ends = (None, None) if local else (params.start, params.target)
-    route = find_path(maps, lattice, vehicle, ends=ends, stretch=not local, params=params)
+    route = find_path(maps, lattice, vehicle, ends=ends, stretch=not local, params=params, begin=begin)
     facts = describe(route, maps, lattice, vehicle) | {"frame": risk.meta.get("frame", "local")}
     return Bundle({"path": route.xyz}, cast(PathFacts, facts))

@@ -40,7 +40,9 @@ class PathParams(Params):
     """Parameters of ``path``. ``start`` and ``target`` concern the path over the whole map, not those of each stop."""
 
     start: Point | None = Field(
-        default=None, description="start x, y, world frame [m]; not set: within a vehicle's length of the first row"
+        default=None,
+        description="start x, y, world frame [m]; not set: within a vehicle's length of the first row, or where the "
+        "rig began, if that is farther up the map",
     )
     target: Point | None = Field(
         default=None, description="target x, y, world frame [m]; not set: as far as rows or connected ground lead"

@@ -29,8 +29,6 @@ NEIGHBOURS = (
     (1, 0, STRAIGHT), (0, -1, ACROSS), (0, 1, ACROSS), (1, -1, RIGHT), (1, 1, LEFT),
 )  # fmt: skip
 """Row, column and direction of the eight steps to a neighbour; the first three lead to the next row."""
-STEPS_AHEAD = 3
-"""Number of the steps that lead to the next row, in order of preference."""
 
 
 class GridCosts(NamedTuple):
@@ -62,7 +60,7 @@ def _sweep(terrain, cost, step):  # type: ignore[no-untyped-def]
     rows, cols = height.shape
     for r in range(rows - 2, -1, -1):
         for c in range(cols):
-            for k in range(STEPS_AHEAD):
+            for k in range(3):
                 _, dc, way = NEIGHBOURS[k]
                 b = c - dc
                 if b < 0 or b >= cols or not ways[r, c] & ways[r + 1, b] & way or cost[r + 1, b] >= UNREACHED:

@@ -46,13 +46,23 @@ from rille.stages.terrain.ground import (
     view_matches,
 )
 from rille.stages.terrain.matches import Matches
+from rille.stages.terrain.points import MIN_DEPTH_SIGMAS
+from rille.stages.terrain.reference import MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE
 
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
 
+HANGING = (
+    "what looks like ground lies above the cameras: are the images of both mirrored top to bottom, which mirrors the "
+    "world, or upside down (then turn them by 180 degrees and exchange left and right, or state world.up), or is it a "
+    "ceiling?"
+)
+
+UPRIGHT = np.array([0.0, -1.0, 0.0])
+"""Up in the frame of a camera whose vertical is not known."""
+
 RELIEF_MARGIN_SHARE = 0.05  # of the camera's height, that the range of elevations is widened by: a low rock, a kerb
 DEFAULT_RANGE_CELLS = 6.0  # of the footprint in meta; the stage locus has its own parameter
-BEYOND_INFINITY_SIGMAS = 3.0  # standard deviations that a match lies beyond infinity, which no noise explains
 MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the reference, though tilted beyond the limits
 
 
@@ -109,7 +119,7 @@ def level(
         return _on_ground(ground, R_local_left, samples, rig, source or GROUND_PLANE)
     except DegenerateError as error:
         why, other = _explained(error, samples, ground)
-    up = np.array([0.0, -1.0, 0.0]) if known_up is None else known_up
+    up = UPRIGHT if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
     try:
@@ -123,7 +133,7 @@ def level(
         "source": source,
         "plane": None,
         "relief": None,
-        "cell_size": _cell_without_ground(rho[rho > BEYOND_INFINITY_SIGMAS * samples.sigma], rig),
+        "cell_size": _cell_without_ground(rho[rho > MIN_DEPTH_SIGMAS * samples.sigma], rig),
         "footprint": None,
         "ground_share": 0.0,
         "no_ground": str(why),
@@ -141,6 +151,15 @@ def level(
         facts["plane"], facts["relief"] = plane, _relief(points, plane, everywhere, ground.height)
         facts["ground_share"], facts["ground_reach"] = ground.inliers, ground.reach
     return facts
+
+
+def _hangs(samples: Samples, up: Floats) -> bool:
+    """Whether a plane above the cameras, ``up`` (3,) being the vertical in their frame, would be ground by itself."""
+    with suppress(DegenerateError):
+        # cos 45 degrees: beyond, cameras look at the plane rather than along it, as backwards down from a drone.
+        plane = fit_plane(samples, lambda n: np.asarray(n @ up <= -0.7))
+        return plane.inliers >= MIN_REFERENCE_SHARE or plane.reach >= MIN_REACH_HEIGHTS
+    return False
 
 
 def _explained(
@@ -271,7 +290,7 @@ def sampled(matches: Matches, rig: Rig, sigma_px: float) -> Samples:
     sigma = per_pixel * sigma_px
     if len(pixels) >= MIN_POINTS:
         # Before the ground is fitted: exchanged images show none, and that message would mislead.
-        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -BEYOND_INFINITY_SIGMAS * sigma)))
+        refuse_impossible(rig, pixels, pixels + disparity, float(np.mean(rho < -MIN_DEPTH_SIGMAS * sigma)))
     return Samples(rig.left.rays(pixels), rho, sigma, sigma_px, coarser_focal(rig))
 
 
@@ -340,8 +359,12 @@ def ground_frame_stage(
     why: str | None = None,
 ) -> Bundle[GroundFacts]:
     """Vertical and reference plane of a basic pair; ``why``: the reason for a reference that is no ground."""
-    given = Rig.from_dict(rig.meta["rig"])
-    facts = level(Matches.of(disparity), given, params, VerticalHint(up, pitch), reference)
+    given, matches, hint = Rig.from_dict(rig.meta["rig"]), Matches.of(disparity), VerticalHint(up, pitch)
+    facts = level(matches, given, params, hint, reference)
     if why is not None:
         facts["why"] = why
+    surely = facts["ground_share"] >= MIN_REFERENCE_SHARE or facts.get("ground_reach", 0.0) >= MIN_REACH_HEIGHTS
+    if reference is None and not surely:
+        samples, known = sampled(matches, given, params.sigma_disparity), _given_vertical(hint)[0]
+        facts |= {"warnings": [HANGING]} if _hangs(samples, UPRIGHT if known is None else known) else {}
     return Bundle({}, facts)

@@ -46,11 +46,6 @@ from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
 from rille.stages.numeric.robust import MAD_TO_SIGMA, TUKEY_BISQUARE, bisquare
 from rille.stages.terrain.radiometry import LOG_GAIN_STEP
 
-RESIDUAL_SCALE_PX = 0.1
-"""Residual that halves a model's weight: the error of a good disparity."""
-ORTHO_WEIGHT_EXPONENT = 8
-"""Of the ortho image's weights: the best image, but without a visible seam."""
-
 
 class Merged(NamedTuple):
     """Maps (rows, cols) of merged cells.
@@ -90,7 +85,8 @@ def merge_cells(
     worst : greatest standard deviation but for the poses, m.
     """
     z, sigma, residual, ortho = maps.astype(np.float64)
-    residual /= RESIDUAL_SCALE_PX
+    # A residual as large as the error of a good disparity halves a model's weight.
+    residual /= 0.1
     with np.errstate(divide="ignore", over="ignore"):
         weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
     known = np.isfinite(z) & (sigma > 0.0) & (residual >= 0.0) & (weight > 0.0) & np.isfinite(weight)
@@ -113,7 +109,8 @@ def merge_cells(
     placed = _total(share * _swing(layers, strip))
     ranged = _total(share * _stretch(layers, strip, z)) * errors.inverse_depth_std
     grey = np.minimum(np.array([layer.gain for layer in layers])[:, None, None] * ortho, 255.0)
-    sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** ORTHO_WEIGHT_EXPONENT, 0.0)
+    # The eighth power: the best image, but without a visible seam.
+    sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** 8, 0.0)
     greys = _total(sharp)
     merged = {
         "elevation": mean,

@@ -27,9 +27,6 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain.merge import seen_finely
 
-SIGHT_STEP_CELLS = 0.5
-"""Cells from point to point of a line of sight."""
-
 
 class OcclusionBoundsParams(Params):
     """Parameters of the stage ``occlusion_bounds``."""
@@ -81,8 +78,9 @@ def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
                 continue
             dr, dc = row - r, col - c
             far = math.hypot(dr, dc)
-            for k in range(1, int(far / SIGHT_STEP_CELLS)):
-                part = k * SIGHT_STEP_CELLS / far
+            # Two points a cell of the line of sight.
+            for k in range(1, int(2.0 * far)):
+                part = k / (2.0 * far)
                 i, j = math.floor(r + part * dr + 0.5), math.floor(c + part * dc + 0.5)
                 if i == r and j == c:
                     continue

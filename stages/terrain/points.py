@@ -26,7 +26,8 @@ from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig
 
 MIN_DEPTH_SIGMAS = 3.0
-"""An inverse depth that is not this many of its standard deviations above 0 may as well be infinitely far."""
+"""An inverse depth that is not this many of its standard deviations above 0 may as well be infinitely far; what is as
+many below 0 is no noise."""
 
 MAX_CUBES = 1_000_000
 """Cubes to either side of the origin."""

@@ -2,7 +2,7 @@
 
 Many scenes hold a level plane that is no ground: a floor under shelves, a table. A pair shows *ground* if
 
-- the vertical is known, and the plane is level but for :data:`MAX_TILT_DEG`; or
+- the vertical is known, and the plane is level but for 10 degrees; or
 - the ground is stated, or holds :data:`MIN_REFERENCE_SHARE` of the pair's matched pixels; or
 - it is open ground, seen as far as :data:`MIN_REACH_HEIGHTS` camera heights; or
 - another pair shows the same plane: its normal turned by at most :data:`MAX_TURN_DEG` in the camera's frame, and the
@@ -27,7 +27,6 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL
 
-MAX_TILT_DEG = 10.0
 MIN_REFERENCE_SHARE = 0.4
 MIN_REACH_HEIGHTS = 5.0
 MAX_TURN_DEG = 10.0
@@ -38,6 +37,13 @@ def seen_up(facts: GroundFacts) -> Floats | None:
     if "seen_up" in facts:
         return np.array(facts["seen_up"])
     return _normal(facts) if facts["plane"] and facts["ground_share"] >= MIN_REFERENCE_SHARE else None
+
+
+def camera_height(facts: GroundFacts) -> float:
+    """Height, m, of the left camera above a pair's plane, along its normal."""
+    assert facts["plane"] is not None
+    x, y, z = facts["plane"]
+    return -z / math.sqrt(x * x + y * y + 1.0)
 
 
 def _normal(facts: GroundFacts) -> Floats:
@@ -97,15 +103,14 @@ class _Plane(NamedTuple):
     @staticmethod
     def of(facts: GroundFacts) -> _Plane:
         """Read the plane of a pair."""
-        assert facts["plane"] is not None
         up = _normal(facts)
         level = float(RigidTransform.from_matrix(facts["T_local_left"]).rotation[2] @ up)
         share, reach = facts["ground_share"], facts["ground_reach"]
         is_known = facts["source"] not in (GROUND_PLANE, NO_VERTICAL)
-        is_level = is_known and level >= math.cos(math.radians(MAX_TILT_DEG))
+        is_level = is_known and level >= math.cos(math.radians(10.0))
         # Ground that is stated (``ground_frame.reference_height``), not seen, has a share of 0.
         is_ground = is_level or share >= MIN_REFERENCE_SHARE or reach >= MIN_REACH_HEIGHTS or share == 0.0
-        return _Plane(up, -facts["plane"][2] * level, is_ground, share, reach)
+        return _Plane(up, camera_height(facts), is_ground, share, reach)
 
     def is_same(self, other: _Plane) -> bool:
         """Whether another pair shows the same plane."""

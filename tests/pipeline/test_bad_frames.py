@@ -66,6 +66,18 @@ def swap(frame: int) -> Callable[[Path], None]:
     return spoil
 
 
+def tear(frame: int, other: int) -> Callable[[Path], None]:
+    """Both images of a frame are those of another one from their middle on."""
+
+    def spoil(folder: Path) -> None:
+        for path, theirs in zip(files(folder, frame), files(folder, other), strict=True):
+            image, rest = (cv2.imread(str(one), cv2.IMREAD_GRAYSCALE) for one in (path, theirs))
+            middle = len(image) // 2
+            assert cv2.imwrite(str(path), np.concatenate([image[:middle], rest[middle:]]))
+
+    return spoil
+
+
 def positions(folder: Path) -> np.ndarray:
     return np.loadtxt(folder / "trajectory.kitti").reshape(-1, 3, 4)[:, :, 3]
 
@@ -75,6 +87,8 @@ def positions(folder: Path) -> np.ndarray:
     [
         pytest.param(change(4, lambda i: 0 * i), 4, "frame 4 lost: black left image", id="black"),
         pytest.param(change(3, lambda i: 0 * i), 3, "frame 3 lost: black left image", id="black, to be basic"),
+        pytest.param(tear(4, 5), 4, "frame 4 lost: it shows two motions", id="torn"),
+        pytest.param(tear(3, 6), 3, "frame 3 lost: it shows two motions", id="torn, to be basic"),
         pytest.param(swap(4), 4, "frame 4 lost: left and right are swapped", id="swapped"),
         pytest.param(
             lambda f: files(f, 4)[1].unlink(), 4, "frame 4 lost: right/000004.png is missing", id="right missing"

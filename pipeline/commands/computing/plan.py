@@ -29,9 +29,6 @@ from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 
-MAX_REASONS = 3
-"""Different reasons of a stage that are printed; ``verbose`` prints each task's."""
-
 
 def plan(
     seq: str = "mockup",
@@ -108,9 +105,9 @@ def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = Fals
 def _reasons(planned: list[Handle]) -> list[str]:
     """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
     own = Counter(h.reason for h in planned if not h.cause)
-    listed = [f"{brief(reason, 80)} ({n})" for reason, n in own.most_common(MAX_REASONS)]
-    if len(own) > MAX_REASONS:
-        listed.append(f"{len(own) - MAX_REASONS} other reasons")
+    listed = [f"{brief(reason, 80)} ({n})" for reason, n in own.most_common(3)]
+    if len(own) > len(listed):
+        listed.append(f"{len(own) - len(listed)} other reasons")
     follow = len(planned) - own.total()
     return listed + ([f"an input is to be computed ({follow})"] if follow else [])
 

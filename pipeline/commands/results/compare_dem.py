@@ -30,10 +30,6 @@ from rille.stages.evaluation.place import register
 from rille.stages.geometry.geometry import from_above, rotation_log
 from rille.stages.terrain.relief.grid import Grid
 
-SHOWN_CHANGES = 12
-"""Patches that are printed; all are in the JSON file."""
-MAX_RELIEF_FACTOR = 2.0
-"""Between two models of one ground; a foot is .3 m."""
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
 
 
@@ -148,7 +144,8 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
     figures["completeness"] = _completeness(error, on_b, a)
     factor = evaluation.relief_factor(on_a, on_b)
-    if not 1.0 / MAX_RELIEF_FACTOR < factor < MAX_RELIEF_FACTOR:
+    # Between two models of one ground; a foot is .3 m.
+    if not 0.5 < factor < 2.0:
         doubt = f"is one of them in another unit{', or of depths' if factor < 0.0 else ''}?"
         text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: {doubt}"
         figures["warnings"].append(warning("RIL-963", text))
@@ -182,11 +179,12 @@ def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
     yield ""
     for way, total in changes["total"].items():
         yield f"{way:5s} {1e6 * total['volume_m3']:.4g} +- {1e6 * total['sigma_m3']:.2g} cm3"
-    for row in changes["patches"][:SHOWN_CHANGES]:
+    shown = changes["patches"][:12]
+    for row in shown:
         place = f"x {row['x_m']:.4f}, y {row['y_m']:.4f} m"
         size = f"{1e4 * row['area_m2']:.4g} cm2, {1e3 * row['greatest_m']:+.3g} mm at most"
         yield f"{place}: {size}, {1e6 * row['volume_m3']:+.4g} +- {1e6 * row['sigma_m3']:.2g} cm3"
-    more = len(changes["patches"]) - SHOWN_CHANGES
+    more = len(changes["patches"]) - len(shown)
     if more > 0:
         yield f"and {more} smaller ones, in the JSON file"
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Mapping
-from itertools import pairwise, product
+from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,18 +22,16 @@ from rille.pipeline.commands import batch
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.folder import StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name
-from rille.pipeline.flow.reconstruction import spread
+from rille.pipeline.flow.reconstruction import spread, vertical
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.runs.session import settings
-from rille.stages.calibration.relative_orientation import MIN_MATCHES
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
-from rille.stages.geometry.sides import fits
-from rille.stages.imaging.features import extract, matched_points
 from rille.stages.imaging.image_quality import glance
 
 Steps = Generator[Wait, Any, None]
@@ -61,12 +61,20 @@ def _check(seq: str, options: Settings) -> int:
 
 def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Path) -> int:
     """Print a line for each finding; 0, or 1 where something fails."""
-    graph, store = Graph(), Store(cache)
-    name(graph, sequence, frames)
-    inspection = Inspection(Builder(graph, sequence, config), frames, store)
-    graph.flow(inspection.steps())
-    # In this process: workers would take longer to start than most of this takes.
-    result = run(graph, store, RunOptions(executor="inline", keep_going=True))
+    with ExitStack() as ends:
+        graph, store, kept = Graph(), Store(cache), list[Finding]()
+        try:
+            store.writable()
+        except StoreError as error:
+            # A check of data on a disk that is read only, say.
+            kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
+            store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
+        name(graph, sequence, frames)
+        inspection = Inspection(Builder(graph, sequence, config), frames, store)
+        inspection.say(*kept)
+        graph.flow(inspection.steps())
+        # In this process: workers would take longer to start than most of this takes.
+        result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # What a stage refuses is a finding, said by then; any other failure is one of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     levels = inspection.levels
@@ -181,13 +189,21 @@ class Inspection:
         matching = judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given)
         self.say(matching)
         if matching.level == "FAIL":
-            yield from self._mirrored(pair)
+            mirror = yield self.make.mirrored(pair)
+            self.say(judge.judge_mirror(mirror.meta["fitting"]))
         if len(left):
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
-        alike = yield self.make.repetition("repetition", [pair])
-        self.say(judge.judge_repetition(alike.meta["repeated"]))
+        self.say(judge.judge_repetition(oriented.meta["repeated"]))
+        fitted, known = self.make.rig([pair])
+        level = self.make.level(pair, vertical(self.make, pair), known)
+        yield Maybe([level])
+        if fitted.ref is None:
+            self.refused(_cause(fitted), "rig")
+        elif "misread" in fitted.ref.meta:
+            self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
+        self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
     def _times(self, whole: list[int]) -> Steps:
         """Whether left and right are of one time; where they are not, from which pair on."""
@@ -199,23 +215,6 @@ class Inspection:
             last = max((pair for pair in chosen if pair < first), default=first)
             between = [k for k in whole if last < k < first]
         self.say(judge.judge_synchrony(rows.meta))
-
-    def _mirrored(self, pair: int) -> Steps:
-        """Whether the images of a pair fit the rig once one of them is mirrored."""
-        opened = [self.store.open(ref) for ref in (yield [self.make.image(pair, camera) for camera in CAMERAS])]
-        arrays = {c: [np.asarray(o[name]) for name in ("image", "valid")] for c, o in zip(CAMERAS, opened, strict=True)}
-        features, shares = {camera: extract(*of) for camera, of in arrays.items()}, dict[tuple[str, str], float]()
-        # Features match whichever way an image is turned: the rig tells which way is right.
-        for (camera, of), (axis, way) in product(arrays.items(), enumerate(("top to bottom", "left to right"))):
-            mirrored = extract(*(np.ascontiguousarray(np.flip(a, axis)) for a in of))
-            points = matched_points(*(features | {camera: mirrored}).values())
-            shares[camera, way] = fits(self.sequence.rig, *points) if len(points[0]) >= MIN_MATCHES else 0.0
-        fitting = {(camera, way): share for (camera, way), share in shares.items() if share > 0.5}
-        if fitting:
-            # Of parallel cameras both fit from top to bottom: then nothing tells which.
-            which = " or ".join(f"the {camera} one is mirrored {way}" for camera, way in fitting)
-            text = f"{max(fitting.values()):.0%} of the matches of the first pair's images fit the rig once {which}"
-            self.say(judge.judge("images", text, {"mirrored": len(fitting)}))
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""

@@ -22,9 +22,6 @@ from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Outp
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.core.validity import matched
 
-MIN_PIXELS_OF_BAR = 1_000_000
-"""Pixels: above, matching takes seconds, and a bar on the terminal shows how far it is."""
-
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -145,7 +142,8 @@ def match(
 @contextmanager
 def _progress(pixels: int) -> Iterator[Callable[[float, str], None]]:
     """Callback that shows share and step of a large match as a bar, where stderr is a terminal."""
-    if pixels < MIN_PIXELS_OF_BAR or not sys.stderr.isatty():
+    # Of a megapixel and more: below, matching takes less than seconds.
+    if pixels < 1_000_000 or not sys.stderr.isatty():
         yield lambda share, step: None
         return
     from rich.console import Console

@@ -41,9 +41,6 @@ LOCATORS_OF_NUMBA = (
     *("IPythonCacheLocator", "ZipCacheLocator"),
 )
 
-UNUSED_DAYS = 30
-"""A kernel that no process asked for so long is removed by ``rille cache gc``."""
-
 PATIENCE_SECONDS, PAUSE_SECONDS = 120.0, 0.02
 """Time that a process waits for another that compiles, and between two looks."""
 
@@ -67,8 +64,8 @@ def folder() -> Path:
 
 
 def unused() -> list[Path]:
-    """Folders of kernels that no process asked for within :data:`UNUSED_DAYS`."""
-    limit, old = time.time() - 86400 * UNUSED_DAYS, []
+    """Folders of kernels that no process asked for within thirty days: ``rille cache gc`` removes them."""
+    limit, old = time.time() - 30 * 86400, []
     for path in sorted(folder().glob("*")):
         with suppress(FileNotFoundError):  # another process clears up, too
             old += [path] if path.stat().st_mtime <= limit else []

@@ -14,11 +14,6 @@ from rille.stages.core.errors import InputError
 
 MAX_FACES = 2_000_000
 """Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
-UNSEEN_GREY = 128
-"""Grey of a cell without ortho image: neutral, for black would look like a shadow."""
-MAX_TEXTURE_PX = 4096
-"""Greatest edge of the texture, pixels: what every WebGL implementation takes."""
-
 Layer = NDArray[np.float64] | None
 """Values of the cells of a terrain, (rows, cols) or of colours (rows, cols, 3), where the run has them."""
 
@@ -109,8 +104,9 @@ def _texture(ortho: Layer) -> Any:
     from trimesh.visual.material import PBRMaterial
 
     bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
-    image = Image.fromarray(np.rint(np.clip(np.nan_to_num(bands, nan=UNSEEN_GREY), 0, 255)).astype(np.uint8))
-    if max(image.size) > MAX_TEXTURE_PX:
-        image.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
+    # Cells without ortho image are of a neutral grey: black would look like a shadow.
+    image = Image.fromarray(np.rint(np.clip(np.nan_to_num(bands, nan=128), 0, 255)).astype(np.uint8))
+    # The greatest texture that every WebGL implementation takes; a smaller one stays as it is.
+    image.thumbnail((4096, 4096))
     # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
     return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)

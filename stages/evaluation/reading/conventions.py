@@ -43,11 +43,12 @@ DIRECTIONS = (
     "its poses lead from the world to the camera: invert each, [R | t] to [R' | -R' t]",
     "its rotations lead from the world to the camera: negate qx, qy and qz, or transpose each R",
 )
+LEFT_HANDED = "it is left-handed, or the images of both cameras are mirrored"
 MIRRORS = {
     "": (1.0, 1.0, 1.0),
-    "it is left-handed: negate x, qy and qz": (-1.0, 1.0, 1.0),
-    "it is left-handed: negate y, qx and qz": (1.0, -1.0, 1.0),
-    "it is left-handed: negate z, qx and qy": (1.0, 1.0, -1.0),
+    f"{LEFT_HANDED}: negate x, qy and qz": (-1.0, 1.0, 1.0),
+    f"{LEFT_HANDED}: negate y, qx and qz": (1.0, -1.0, 1.0),
+    f"{LEFT_HANDED}: negate z, qx and qy": (1.0, 1.0, -1.0),
 }
 
 

@@ -22,9 +22,6 @@ FARTHEST_OFF = 2047
 SHARP = 3.0
 """Byte steps a pixel: a softer band hardly says in which row to search."""
 
-TRUNCATION = 2
-"""Pixels: beyond this a step to a neighbour costs no more, so that depth edges stay."""
-
 COLUMNS = 8
 """Columns that are searched together."""
 
@@ -253,10 +250,10 @@ def _apart(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _roughness(shift, near):  # type: ignore[no-untyped-def]
-    """Sum over the neighbours of min(|du| + |dv|, TRUNCATION)."""
+    """Sum over the neighbours of min(|du| + |dv|, 2 pixels): depth edges, where a step is longer, stay."""
     total = 0
     for k in range(4):
-        total += min(_apart(shift, near[k]), TRUNCATION)
+        total += min(_apart(shift, near[k]), 2)
     return total
 
 

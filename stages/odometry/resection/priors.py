@@ -235,12 +235,14 @@ class Sensors:
         if self.georeference is None:
             self.lines.append(f"[positions] in their frame {named}: state these with world.crs, and maps lie there")
             return
-        variances = np.diag(done.graph.covariance(done.state)[-1])
+        covariance, R = done.graph.covariance(done.state)[-1], done.state.R[-1]
+        # Along the axes of the positions: without heights the place may slide along their vertical, not the world's.
+        variances = np.diag(R.T @ covariance[:3, :3] @ R)
         off = float(np.linalg.norm((origin - self.georeference["origin"])[told]))
         turn = math.radians(azimuth) - self.georeference["azimuth"]
         turn = abs(math.remainder(turn, math.tau))
-        apart = off > MIN_SIGMAS * math.sqrt(variances[:3][told].sum())
-        turned = turn > max(MIN_SIGMAS * math.sqrt(variances[5]), MIN_LEAN)
+        apart = off > MIN_SIGMAS * math.sqrt(variances[told].sum())
+        turned = turn > max(MIN_SIGMAS * math.sqrt(covariance[5, 5]), MIN_LEAN)
         # 1000.0: distance of the world's origin by positions from the stated one, from which on their frame is another
         # one.
         if off < 1000.0 and (apart or turned):

@@ -55,8 +55,6 @@ MIN_LANDMARKS = 6
 """Fewest landmarks of a pose: twelve equations for six unknowns, so that one wrong landmark shows."""
 SHARED_SOURCES = 7
 """Error sources that all segments share: one for each of the six pose parameters, and the bias of the disparities."""
-SEARCHED_PX = 9.0
-"""Side [pixels] of the square around a prediction within which tracking finds a point, right or wrong: 2 * 4 + 1."""
 THRESHOLD_SHARES = (0.25, 0.5, 1.0)
 """Shares of the threshold at which agreement is counted."""
 
@@ -352,8 +350,10 @@ def _not_by_chance(errors: Errors, params: ResectParams, where: str) -> None:
     for part in THRESHOLD_SHARES:
         bound = part * params.threshold
         count = int((errors.norm <= bound / params.pixel_sigma).sum())
-        strip = min(2.0 * bound / SEARCHED_PX, 1.0)  # the most that a long ellipse leaves of the square
-        share = float(np.minimum(math.pi * (bound / SEARCHED_PX) ** 2 * stretch, strip).mean())
+        # Of the side of the square around a prediction within which tracking finds a point: 2 * 4 + 1 pixels.
+        reach = bound / 9.0
+        strip = min(2.0 * reach, 1.0)  # the most that a long ellipse leaves of the square
+        share = float(np.minimum(math.pi * reach**2 * stretch, strip).mean())
         if share == 1.0:  # a threshold that every place passes was chosen so as to believe everything
             return
         if count >= MIN_LANDMARKS:

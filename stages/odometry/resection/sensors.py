@@ -120,14 +120,14 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
     angle = float(np.linalg.norm(axis))
     reads = []
     if np.linalg.det(Q) < 0:
-        reads.append("two of its axes are exchanged, or one has the wrong sign")
+        reads.append("two of its axes are exchanged, one has the wrong sign, or both cameras' images are mirrored")
     elif angle > math.radians(2.0):
         about = ", ".join(f"{v:.2f}" for v in axis / angle)
         reads.append(f"it is turned by {math.degrees(angle):.1f} degrees about ({about}) of the left camera")
     if abs(scale - 1.0) > 0.5 * allowed:
         # Metres of a degree of latitude and, as far north as people drive, of longitude
         unit = " (degrees are no metres)" if 3e4 < scale < 1.2e5 else ""
-        reads.append(f"its lengths have to be multiplied by {scale:.3g}{unit}")
+        reads.append(f"its lengths have to be multiplied by {scale:.3g}{unit}, or the rig's baseline divided")
     fits = f"; {' and '.join(reads)}, which leaves {left:.1%}" if reads and left < 0.5 * off else ""
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 

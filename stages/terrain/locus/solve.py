@@ -18,7 +18,6 @@ from rille.stages.terrain.matches import Matches
 
 COARSE_CELLS = 8  # cells that a coarse cell is wide: a 64th of the cells search the whole range
 MAX_JUMP_PX = 3.0  # range of the four disparities around a cell that are one surface; beyond, ground is hidden there
-ONE_SIDED_STD_FACTOR = 2.0  # matched one way alone: errors of such cells are two to three times as large
 
 
 class LocusParams(Params):
@@ -99,7 +98,7 @@ def join(a: Dem, b: Dem) -> Dem:
     """Elevations read from left to right and from right to left: their weighted mean where both are.
 
     Its variance is the product of both standard deviations (they share the images: no gain) and the square of their
-    difference. What only one direction gave is most often beside an occlusion, and :data:`ONE_SIDED_STD_FACTOR` times
+    difference. What only one direction gave is most often beside an occlusion, and twice
     as uncertain as it looks. The grey value is that of ``a``.
     """
     za, zb, sa, sb = (v.astype(np.float64) for v in (a.elevation, b.elevation, a.elevation_std, b.elevation_std))
@@ -107,6 +106,7 @@ def join(a: Dem, b: Dem) -> Dem:
     both = only_a & np.isfinite(zb)
     share = sb**2 / (sa**2 + sb**2)
     z = np.where(both, zb + share * (za - zb), np.where(only_a, za, zb))
-    std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), ONE_SIDED_STD_FACTOR * np.where(only_a, sa, sb))
+    # Errors of cells matched one way alone are two to three times as large.
+    std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), 2.0 * np.where(only_a, sa, sb))
     residual = np.where(only_a, a.residual, b.residual)
     return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)

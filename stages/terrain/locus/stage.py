@@ -44,7 +44,6 @@ from rille.stages.terrain.locus.uncertainty import NEAR_SIDE_CELLS, standard_dev
 from rille.stages.terrain.locus.views import SurfaceViews, View, facing
 from rille.stages.terrain.matches import Matches
 
-OWN_STD_FACTOR = 1.4  # times max_sigma: a cell's own standard deviation scatters about the typical one
 NO_LIMIT = {"max_sigma": None, "max_std": None}
 
 
@@ -143,7 +142,8 @@ def greatest_std(params: LocusParams, measured: bool) -> float | None:
         return params.max_std
     if params.max_sigma is None:
         return None
-    return OWN_STD_FACTOR * params.max_sigma if measured else params.max_sigma
+    # 1.4: a cell's own standard deviation scatters about the typical one.
+    return 1.4 * params.max_sigma if measured else params.max_sigma
 
 
 def local_lattice(view: PlaneView, cell: float, params: LocusParams) -> Lattice:

@@ -60,8 +60,6 @@ HOLE_VARIANCE_PX2 = 0.12
 DIFFERENCE_FACTOR = 0.87
 ONE_SIDED_DIFFERENCE_PX = 0.2
 """Pixels of disparity: difference of both directions where only one of them found something."""
-MIN_GRADIENT_POWER = 1.0
-"""Squared grey levels a pixel, of each cell: so that a blank wall is not divided by."""
 STEP_SIDE_CELLS = 3
 """Side of the window of t."""
 NEAR_SIDE_CELLS = 5
@@ -136,9 +134,8 @@ def _gradients(seen: OrthoPair, scale: Floats32, known: Bools) -> Floats32:
     """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
     slope = (seen.right_slope - seen.left_slope) / scale
     power = np.where(known, np.square(slope) * np.minimum(seen.area, 1.0), np.float32(0.0))
-    return np.maximum(window_sum32(power, NEAR_SIDE_CELLS), np.float32(0.0)) + np.float32(
-        MIN_GRADIENT_POWER * NEAR_SIDE_CELLS**2
-    )
+    # One squared grey level a pixel, of each cell: so that a blank wall is not divided by.
+    return np.maximum(window_sum32(power, NEAR_SIDE_CELLS), np.float32(0.0)) + np.float32(NEAR_SIDE_CELLS**2)
 
 
 def _steps(elevation: Floats32, scale: Floats32, known: Bools) -> Floats32:

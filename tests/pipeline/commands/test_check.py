@@ -78,7 +78,17 @@ def test_a_sound_folder_passes(tmp_path, capsys):
     assert not [text for text in lines if text.startswith(("WARN", "FAIL"))]
     assert "median 4 m" in line(lines, "matching")
     assert line(lines, "sides").startswith("OK")
+    assert "no ground plane" in line(lines, "ground")
     assert "4 of 4 pairs" in line(lines, "sequence")
+
+
+def test_a_cache_that_cannot_be_written_costs_nothing_but_what_it_would_keep(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    (tmp_path / "cache").write_text("no folder")
+    code, lines = run(path, capsys)
+    assert code == 0
+    assert "(Not a directory): what is computed is not kept" in line(lines, "cache")
+    assert "median 4 m" in line(lines, "matching")
 
 
 def test_swapped_folders_fail(tmp_path, capsys):

@@ -240,12 +240,12 @@ def test_command_line_has_it_all(folder, capsys):
 def test_progress_is_a_bar_on_a_terminal_for_large_pairs(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(command.sys, "stderr", stream)
-    with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
+    with command._progress(1_000_000) as tell:
         tell(0.5, "level 0")
     monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-    with command._progress(command.MIN_PIXELS_OF_BAR - 1) as tell:
+    with command._progress(999_999) as tell:
         tell(0.5, "level 0")
     assert not stream.getvalue()
-    with command._progress(command.MIN_PIXELS_OF_BAR) as tell:
+    with command._progress(1_000_000) as tell:
         tell(0.5, "level 0")
     assert "level 0" in stream.getvalue()

@@ -15,7 +15,7 @@ from rille.pipeline.flow import config
 from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
-from rille.pipeline.flow.reconstruction import SEAMS, cells_in_both, overlaps, spread
+from rille.pipeline.flow.reconstruction import cells_in_both, overlaps, spread
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
@@ -165,7 +165,7 @@ def test_a_model_is_compared_with_those_that_share_most_ground_however_often_a_p
     others = {pair: [int(handle.label) for handle in seam.upstream()[1:]] for pair, seam in seams.items()}
     assert others[20] == list(range(20))
     assert others[59] == [*range(18, 30), *range(47, 59)], "the nearest of both times"
-    assert len(others[59]) == SEAMS
+    assert len(others[59]) == 24
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,7 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(positions, rot
 def given(positions, rotation, footprint):
     """A run with these positions (frame, 3), f = 350 px, 600 x 200 pixels, a baseline of .5 m."""
     poses = np.concatenate([np.broadcast_to(rotation, (len(positions), 3, 3)), positions[:, :, None]], axis=2)
-    level = SimpleNamespace(meta={"footprint": footprint})
+    level = SimpleNamespace(meta={"footprint": footprint, "plane": footprint and [0.0, 0.75, -2.0]})
     camera = SimpleNamespace(fx=350.0, fy=350.0, width=600, height=200)
     levels = {0: level, 4: None}
     return SimpleNamespace(
@@ -207,6 +207,7 @@ def test_what_rests_on_the_given_numbers_is_said_in_figures_of_the_run(way, by_f
     assert f"focal length (350 px) is {by_focal_length};" in line
     assert "(6 px) leads its end 0.206 m aside" in line
     assert "ground 10 m ahead by 57.1 mm" in line
+    assert line.endswith("the left camera stands 1.60 m above the ground.")
 
 
 def test_nothing_rests_on_the_given_numbers_of_a_camera_without_a_path():

@@ -70,9 +70,9 @@ def scene(true: Rig):
 
 
 def run(rig: Rig, found: Bundle, **params):
-    return orientation.orientation_stage.run(
-        OrientationParams(**params), {"pair": 7, "rig": rig.to_dict()}, {"disparity": found}
-    )
+    image = Bundle({"image": np.random.default_rng(1).normal(128, 40, found["validity"].shape)}, {})
+    ports = {"disparity": found, "left": image, "right": image}
+    return orientation.orientation_stage.run(OrientationParams(**params), {"pair": 7, "rig": rig.to_dict()}, ports)
 
 
 def test_stage_on_a_dense_disparity():

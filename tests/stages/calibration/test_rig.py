@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from rille.stages.calibration.relative_orientation import RIG, PointPairs, linea
 from rille.stages.calibration.rig import RigParams, _drift, orient_rig
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.epipolar import NAMES
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.geometry import Rig, RigidTransform, rotation_exp
 
 
 def facts(rig: Rig, pairs, **params):
@@ -53,7 +54,9 @@ def test_no_baseline_is_refused():
 def test_stage_reads_what_orientation_writes():
     rig = street_rig()
     bundles = [
-        Bundle({"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair})
+        Bundle(
+            {"left": m.left.astype(np.float32), "right": m.right.astype(np.float32)}, {"pair": m.pair, "repeated": 0.1}
+        )
         for m in street(pitch_deg=0.3)
     ]
     meta = rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
@@ -211,6 +214,16 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
     assert told(away, shown=True) == []
     assert told(alone, shown=False) == []  # what the pair's own values claim and its rows do not show
     assert told(alone, shown=True)[0].startswith(f"the rig moves: {NAMES[strong].replace('_', ' ')} of 1 of 5 pairs")
+
+
+def test_images_of_both_cameras_that_are_mirrored_are_named_where_the_rig_is_not_symmetric():
+    bed = bed_rig()
+    tilted = RigidTransform(rotation_exp([0.0, 0.0, -0.06]) @ bed.T_right_left.rotation, bed.T_right_left.translation)
+    for rig, told in ((Rig(bed.left, bed.right, tilted), True), (bed, False)):
+        seen, size = [matches(rig, bed_depth, pair=k) for k in range(2)], [0.0, rig.left.height - 1.0]
+        pairs = [PointPairs(m.pair, m.left * [1, -1] + size, m.right * [1, -1] + size) for m in seen]
+        with raises("RIL-684") if told else nullcontext():
+            assert not orient_rig(rig, pairs, RigParams())["changed"]
 
 
 def test_swapped_images_are_named():

@@ -13,7 +13,6 @@ from rille.stages.core.validity import Validity
 from rille.stages.driving.obstacle_monitor import (
     MIN_POINTS,
     MIN_RISE_WHEELS,
-    MODEL_RADIUS_WHEELS,
     LastModel,
     Obstacle,
     ObstacleMonitorParams,
@@ -78,7 +77,7 @@ def surface(block: tuple[float, float, float, float] | None = None) -> LastModel
     if block is not None:
         xy = LATTICE.xy()
         z[(np.abs(xy[..., 0] - block[0]) < block[2]) & (np.abs(xy[..., 1] - block[1]) < block[2])] = block[3]
-    return LastModel.of(z, LATTICE, MODEL_RADIUS_WHEELS * ROVER.wheel_diameter)
+    return LastModel.of(z, LATTICE, 0.5 * ROVER.wheel_diameter)
 
 
 def found(v: ViewPair, s: LastModel) -> Obstacle | None:

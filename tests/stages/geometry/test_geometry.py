@@ -18,6 +18,7 @@ from rille.stages.geometry.geometry import (
     level_rotation,
     orthonormal,
     rotation_exp,
+    rotation_log,
 )
 
 CAMERA = Camera(600.0, 610.0, 285.0, 260.0, 570, 520)
@@ -90,6 +91,17 @@ def test_level_rotation_of_a_camera_that_looks_down() -> None:
     np.testing.assert_allclose(level_rotation([0.0, 0.0, -1.0]), [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-15)
     for tilt in ([0.1, 0.0], [0.0, 0.1], [-0.1, 0.1]):
         assert level_rotation([*tilt, -1.0])[1] @ [0, -1, 0] > 0.99
+
+
+@pytest.mark.parametrize("to", [[0.0, -1.0], [-0.7, -0.7], [1.0, 0.0]])
+@pytest.mark.parametrize("down", [-1.0, 1.0])
+def test_level_rotation_of_a_camera_that_tilts_does_not_jump(to: list[float], down: float) -> None:
+    """From straight down (or up) to the horizon, ahead or aside: half a degree of tilt turns it by 3 at most."""
+    tilts = np.radians(np.arange(0.0, 90.0, 0.5))
+    ups = np.array([[to[0] * math.sin(t), to[1] * math.sin(t), down * math.cos(t)] for t in tilts])
+    turned = np.array([level_rotation(up) for up in ups])
+    steps = np.einsum("nij,nkj->nik", turned[1:], turned[:-1])
+    assert np.degrees(np.linalg.norm(rotation_log(steps), axis=1)).max() < 3.0
 
 
 def test_orthonormal_repairs_rounding() -> None:

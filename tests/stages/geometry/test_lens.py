@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from raising import raises
 
 from rille.stages.geometry.geometry import Camera
-from rille.stages.geometry.lens import MIN_FOCAL_SHARE, Lens
+from rille.stages.geometry.lens import Lens
 
 UNIT = Camera(100.0, 200.0, 50.0, 40.0, 101, 81)
 RAW = Camera(460.0, 458.0, 367.2, 248.4, 752, 480)
@@ -158,8 +158,8 @@ def test_the_farthest_edge_of_a_narrow_fisheye_decides(edge):
 
 def test_ideal_camera_of_a_wide_fisheye_keeps_most_of_its_resolution():
     lens = LENSES["fisheye"]
-    assert lens.ideal_camera().fx == pytest.approx(MIN_FOCAL_SHARE * lens.camera.fx)
-    assert lens.ideal_camera().fy == pytest.approx(MIN_FOCAL_SHARE * lens.camera.fy)
+    assert lens.ideal_camera().fx == pytest.approx(0.7 * lens.camera.fx)
+    assert lens.ideal_camera().fy == pytest.approx(0.7 * lens.camera.fy)
 
 
 def test_ideal_lenses():

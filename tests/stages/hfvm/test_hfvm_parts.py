@@ -198,7 +198,7 @@ class TestPlane:
         rng = np.random.default_rng(0)
         wild = rng.uniform(size=u.shape) < 0.3
         u, v = np.where(wild, u - rng.uniform(5, 20, u.shape), u), v + rng.normal(0, 0.1, v.shape)
-        h, share = plane.fit_points(Sample(*(a.ravel() for a in (x, y, u, v))), u.shape, 1.0)
+        h, share = plane.fit_points(Sample(*(a.ravel() for a in (x, y, u, v))), u.shape)
         corners = np.array([[0, 79, 0, 79], [0, 0, 59, 59], [1, 1, 1, 1]])
         a, b = h @ corners, self.H @ corners
         # Noise 0.1 px over 3000 matches: hundredths; the robust weights leave a little of the outliers.

@@ -31,7 +31,7 @@ def test_noise_part_is_the_inverse_structure_tensor_of_the_window():
     )
     gy, gx = ((b - a) / 2e-4 for a, b in zip(low, high, strict=True))
     g = np.stack([gx[window].ravel(), gy[window].ravel()])
-    tensor = 25 * np.cov(g, bias=True) + 25 * refinement.ASSUMED_NOISE_VARIANCE * np.eye(2)
+    tensor = 25 * np.cov(g, bias=True) + 25 * 8.0 * np.eye(2)
     assert per_noise(image, image)[y, x] == pytest.approx(np.linalg.inv(tensor)[0, 0], rel=1e-4)
 
 

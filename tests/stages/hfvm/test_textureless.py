@@ -10,7 +10,7 @@ from rille.stages.hfvm.image import Window, pack, whole
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
-from rille.stages.hfvm.textureless import MAX_DISTANCE, MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, Region, search
+from rille.stages.hfvm.textureless import MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, Region, search
 
 ROWS, COLS = 220, 300
 WALL = -8.0
@@ -173,7 +173,7 @@ def test_search_and_its_definition_agree():
             if (q < 0).any() or (q >= 40).any() or (p < 0).any() or (p >= 60).any() or not valid[q, p].all():
                 continue
             apart = np.abs(a[j + window.y0, i + window.x0] - b[q, p]).sum(axis=1)
-            sums[y, x, n] = np.minimum(apart, MAX_DISTANCE).sum()
+            sums[y, x, n] = np.minimum(apart, 60).sum()
     claims = {}
     for n, step in enumerate(steps.astype(int)):
         for y, x in inside_region:

@@ -37,7 +37,7 @@ def test_points_are_spread_even_where_one_corner_is_much_stronger():
     rng = np.random.default_rng(1)
     image = (100 + 10 * rng.standard_normal((120, 160))).astype(np.float32)
     image[:40, :40] = 100 + 80 * rng.standard_normal((40, 40))
-    points = interest_points(image, np.ones(image.shape, np.uint8), 48, noise=1.5, border=8)
+    points = interest_points(image, np.ones(image.shape, np.uint8), 48, noise=1.5)
     assert len(points) == 48
     quarters = {(bool(x > 80), bool(y > 60)): 0 for x, y in points}
     for x, y in points:
@@ -49,7 +49,7 @@ def test_the_strongest_of_a_bucket_is_taken():
     image = np.full((60, 60), 100.0, np.float32)
     for row, col, step in ((12, 12, 20.0), (22, 22, 40.0), (12, 45, 20.0)):
         image[row, col] += step
-    points = interest_points(image, np.ones(image.shape, np.uint8), 4, noise=0.5, border=8)  # buckets of 30 x 30
+    points = interest_points(image, np.ones(image.shape, np.uint8), 4, noise=0.5)  # buckets of 30 x 30
     # A single pixel gives a plateau of windows that hold it; the third is the second of its bucket.
     assert np.abs(points - [[22, 22], [45, 12], [12, 12]]).max() <= 2
 
@@ -57,7 +57,7 @@ def test_the_strongest_of_a_bucket_is_taken():
 def test_noise_alone_gives_no_points():
     rng = np.random.default_rng(2)
     image = (100 + 1.5 * rng.standard_normal((200, 200))).astype(np.float32)
-    assert len(interest_points(image, np.ones(image.shape, np.uint8), 100, noise=1.5, border=8)) == 0
+    assert len(interest_points(image, np.ones(image.shape, np.uint8), 100, noise=1.5)) == 0
 
 
 def test_mask_and_border_are_respected():
@@ -65,7 +65,7 @@ def test_mask_and_border_are_respected():
     image = (100 + 30 * rng.standard_normal((100, 100))).astype(np.float32)
     valid = np.ones(image.shape, np.uint8)
     valid[:, 50:] = 0
-    points = interest_points(image, valid, 60, noise=1.5, border=8)
+    points = interest_points(image, valid, 60, noise=1.5)
     assert len(points) > 20
     assert points.min() >= 8
     assert points[:, 0].max() < 50 - 8
@@ -78,14 +78,14 @@ def test_only_empty_buckets_are_filled():
     valid = np.ones(image.shape, np.uint8)
     y, x = np.mgrid[5:50:10, 5:100:10]
     held = np.stack([x.ravel(), y.ravel()], -1).astype(np.float64)  # every bucket (10 x 10) of the upper half
-    new = interest_points(image, valid, 100, noise=1.5, border=8, occupied=held)
+    new = interest_points(image, valid, 100, noise=1.5, occupied=held)
     assert len(new) > 20
     assert (new[:, 1] >= 50).all()
     assert len(np.unique(new // 10, axis=0)) == len(new)  # one a bucket
 
 
 def test_empty_image_and_tiny_image():
-    assert len(interest_points(np.zeros((40, 40), np.float32), np.zeros((40, 40), np.uint8), 9, noise=1, border=8)) == 0
+    assert len(interest_points(np.zeros((40, 40), np.float32), np.zeros((40, 40), np.uint8), 9, noise=1)) == 0
     assert interest_operator(np.ones((5, 5), np.float32)).max() == 0.0
 
 
@@ -108,5 +108,5 @@ def test_points_are_the_peaks_that_a_plain_search_finds():
             before = np.arange(25).reshape(5, 5) < 12
             if response[y, x] >= around.max() and not (around[before] == response[y, x]).any() and response[y, x] > 150:
                 peaks.add((x, y))
-    found = interest_points(image, np.ones(image.shape, np.uint8), 10000, noise=1.0, border=8)
+    found = interest_points(image, np.ones(image.shape, np.uint8), 10000, noise=1.0)
     assert {(int(x), int(y)) for x, y in found} == peaks

@@ -238,12 +238,16 @@ def test_positions_without_heights_say_nothing_of_the_height_of_the_world():
     assert ", HEIGHT (not measured)]" in line
 
 
+@pytest.mark.parametrize("heights", [True, False])
 @pytest.mark.parametrize(("east", "turn", "named"), [(0.0, 0.0, 0), (1.0, 0.0, 1), (0.0, 1.5, 1), (5e4, 30.0, 0)])
-def test_positions_contradict_a_stated_place(east, turn, named):
+def test_positions_contradict_a_stated_place(east, turn, named, heights):
     truth, rng = winding(), np.random.default_rng(6)
     segments, before = run_of(truth, rng)
     place = {"origin": [4.5e5 + east, 5.4e6, 300.0], "azimuth": np.deg2rad(turn) - 1.0}
-    lines = adjusted(segments, before, {**gnss(truth, rng, sigma=0.02), "georeference": place}).meta["warnings"]
+    given = gnss(truth, rng, sigma=0.02)
+    if not heights:
+        given["positions"] |= {"positions": [row[:2] for row in given["positions"]["positions"]]}
+    lines = adjusted(segments, before, {**given, "georeference": place}).meta["warnings"]
     assert len([line for line in lines if "contradict the stated place" in line]) == named
 
 

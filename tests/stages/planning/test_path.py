@@ -252,6 +252,19 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert describe(from_start, given, lattice, SHORT)["left_out_m"][1] > 0.70, "the other side is left out"
 
 
+@pytest.mark.parametrize(("y", "closed", "begins"), [(-0.6, False, -0.3), (0.0, False, 0.0), (0.0, True, 0.0)])
+def test_a_mission_begins_where_the_rig_began(y: float, closed: bool, begins: float) -> None:
+    """The map's first row lies ahead of it after a straight drive, far behind it after an orbit."""
+    lattice = Lattice.at(-30, 60, CELL, 91, 61)
+    risk, z = level(lattice)
+    if closed:  # a ring around it
+        risk[52:69, 32:49] = HAZARDOUS
+        risk[55:66, 35:46] = 0
+    route = find_path(maps(risk, z), lattice, SHORT, stretch=True, begin=(0.1, y))
+    assert route.xyz[0, :2] == pytest.approx([0.1 if begins == 0.0 else 0.0, begins], abs=0.12 if closed else 0.05)
+    assert route.xyz[-1, 1] > 0.5
+
+
 def test_from_a_start_alone_a_mission_goes_round_as_well() -> None:
     lattice = Lattice.at(-30, 60, CELL, 61, 61)
     risk, z = level(lattice)

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
-from rille.stages.planning.row_graph import NEIGHBOURS, STEPS_AHEAD, UNREACHED, GridCosts, sweep, trace
+from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, GridCosts, sweep, trace
 
 ALL_DIRECTIONS = STRAIGHT | RIGHT | ACROSS | LEFT
 
@@ -132,5 +132,5 @@ def test_an_edge_is_used_where_both_ends_allow_its_direction() -> None:
 
 
 def test_steps_ahead_lead_to_the_next_row() -> None:
-    assert [dr for dr, _, _ in NEIGHBOURS[:STEPS_AHEAD]] == [-1, -1, -1]
+    assert [dr for dr, _, _ in NEIGHBOURS[:3]] == [-1, -1, -1]
     assert len({(dr, dc) for dr, dc, _ in NEIGHBOURS}) == 8

@@ -293,6 +293,34 @@ def test_stage_uses_only_measured_pixels_and_is_repeatable() -> None:
     json.dumps(facts, allow_nan=False)
 
 
+@pytest.mark.parametrize("pitch", [0.0, 12.0])
+def test_images_that_are_mirrored_top_to_bottom_show_ground_above_the_cameras(pitch: float) -> None:
+    """Of parallel cameras matches, epipolar lines and motions are faultless then, and the world is mirrored."""
+    cam = Camera(350.0, 350.0, 199.5, 64.5, 400, 130)
+    rig = Rig(cam, cam, RigidTransform(np.eye(3), [-0.54, 0.0, 0.0]))
+    scene = nearest(plane(0.0, 0.0, -1.65), box((-9.0, 0.0, -1.65), (-5.0, 200.0, 9.0)))
+    column, row, usable = disparity(rig, pitched(pitch), scene)
+    for way, warned in ((1, False), (-1, True)):
+        maps = {"column_disparity": column[::way].astype("f4"), "row_disparity": way * row[::way].astype("f4")}
+        maps |= {"validity": np.where(usable[::way], Validity.MATCHED, 0).astype(np.uint8)}
+        maps |= {"backmatch_error": np.zeros(usable.shape, "f4")}
+        inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
+        facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
+        assert facts.get("warnings") == ([level_stage.HANGING] if warned else None)
+
+
+def test_a_drone_that_tilts_backwards_sees_no_ground_above() -> None:
+    T = pitched(110.0)  # 20 degrees beyond straight down
+    column, row, usable = disparity(RIG, T, plane(0.0, 0.0, -HEIGHT))
+    maps = {"column_disparity": column.astype("f4"), "row_disparity": row.astype("f4")}
+    maps |= {"validity": np.where(usable, Validity.MATCHED, 0).astype(np.uint8)}
+    maps |= {"backmatch_error": np.zeros(usable.shape, "f4")}
+    inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": RIG.to_dict()})}
+    facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
+    assert "no_ground" in facts
+    assert "warnings" not in facts
+
+
 @pytest.mark.data
 def test_kitti_street(data_dir: Path) -> None:
     """The cameras of the KITTI car are mounted 1.65 m above the road, level to a degree or two."""

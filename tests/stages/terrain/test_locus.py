@@ -250,7 +250,7 @@ def test_cells_of_a_great_standard_deviation_of_their_own_are_left_out() -> None
     seen = np.isfinite(whole.elevation)
     # Ten times the disparity's standard deviation is ten times the elevation's; the bound lies between both.
     low = np.nanmax(whole.elevation_std[whole.elevation_std < 5.0 * np.nanmin(whole.elevation_std)])
-    for name, bound in (("max_std", float(low) * 1.0001), ("max_sigma", float(low) * 1.0001 / stage.OWN_STD_FACTOR)):
+    for name, bound in (("max_std", float(low) * 1.0001), ("max_sigma", float(low) * 1.0001 / 1.4)):
         kept = np.isfinite(dem(**{name: bound}).elevation)
         assert np.array_equal(kept, seen & (whole.elevation_std <= low)), name
         assert 0 < np.count_nonzero(seen & ~kept) < 0.5 * np.count_nonzero(seen)

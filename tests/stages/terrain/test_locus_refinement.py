@@ -8,7 +8,7 @@ from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.spline import coefficients
 from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
-from rille.stages.terrain.locus.solve import ONE_SIDED_STD_FACTOR, join
+from rille.stages.terrain.locus.solve import join
 from rille.stages.terrain.locus.stage import LocusParams, MatchedPair, reconstruct
 from rille.stages.terrain.locus.uncertainty import HOLE_VARIANCE_PX2, standard_deviation
 from rille.stages.terrain.locus.views import SurfaceViews, View, look
@@ -233,7 +233,7 @@ def test_both_directions_are_joined_by_hand() -> None:
     np.testing.assert_allclose(found.elevation, [[1.06, 1.0, 2.0, nan]], rtol=1e-6)
     np.testing.assert_allclose(
         found.elevation_std,
-        [[np.sqrt(0.02 + 0.09), 0.1 * ONE_SIDED_STD_FACTOR, 0.3 * ONE_SIDED_STD_FACTOR, nan]],
+        [[np.sqrt(0.02 + 0.09), 0.2, 0.6, nan]],
         rtol=1e-6,
     )
     np.testing.assert_allclose(found.residual, [[0.1, 0.1, 0.1, nan]], rtol=1e-6)

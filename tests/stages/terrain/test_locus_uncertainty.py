@@ -9,7 +9,6 @@ from rille.stages.terrain.locus.uncertainty import (
     FLOOR_PX,
     HOLE_VARIANCE_PX2,
     MIN_AREA_PX,
-    MIN_GRADIENT_POWER,
     ONE_SIDED_DIFFERENCE_PX,
     REST_FACTOR,
     SHADE_FACTOR,
@@ -55,7 +54,7 @@ def expected(
     variance = (
         FLOOR_PX**2
         + STEP_FACTOR * (SCALE * rise) ** 2 / min(area, 1.0)
-        + REST_FACTOR * NOISE**2 / (25 * (CONTRAST**2 * min(area, 1.0) + MIN_GRADIENT_POWER))
+        + REST_FACTOR * NOISE**2 / (25 * (CONTRAST**2 * min(area, 1.0) + 1.0))
     )
     variance += (
         (SHADE_FACTOR * noise / grey) ** 2

@@ -16,8 +16,6 @@ from rille.stages.geometry.lattice import Lattice, mosaic
 from rille.stages.terrain import merge as merge_stage
 from rille.stages.terrain.merge import (
     EXACT,
-    ORTHO_WEIGHT_EXPONENT,
-    RESIDUAL_SCALE_PX,
     Merged,
     MergeParams,
     Placed,
@@ -77,11 +75,11 @@ def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
         rng.uniform(*ends, (2, *TILE.shape)) for ends in ((0, 1), (0.05, 0.2), (0, 0.3), (9, 200))
     )
     merged = merge([layer(k, z[k], std[k], residual[k], ortho[k]) for k in range(2)], TILE, PARAMS)
-    weight = 1.0 / (std**2 * (1.0 + (residual / RESIDUAL_SCALE_PX) ** 2))
+    weight = 1.0 / (std**2 * (1.0 + (residual / 0.1) ** 2))
     share = weight / weight.sum(axis=0)
     mean = (share * z).sum(axis=0)
     alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
-    sharp = (weight / weight.max(axis=0)) ** ORTHO_WEIGHT_EXPONENT
+    sharp = (weight / weight.max(axis=0)) ** 8
     np.testing.assert_allclose(merged.elevation, mean, rtol=1e-5)
     np.testing.assert_allclose(merged.relief_std, np.sqrt(alone), rtol=1e-5)
     np.testing.assert_allclose(merged.elevation_std**2, (1 - PARAMS.alike) * alone + PARAMS.alike * together, rtol=1e-5)

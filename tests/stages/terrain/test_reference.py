@@ -8,7 +8,7 @@ import pytest
 
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.pose_arrays import GROUND_PLANE
-from rille.stages.terrain.reference import MAX_TILT_DEG, MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE, judge
+from rille.stages.terrain.reference import MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE, judge
 
 WALL = {"no_ground": "a wall", "plane": None, "ground_share": 0.0}
 OTHER = {**WALL, "other_up": [0.8, -0.6, 0.0]}
@@ -33,7 +33,7 @@ def ground(share: float = 0.2, reach: float = 3.0, height: float = 1.6, roll: fl
         ([ground(reach=MIN_REACH_HEIGHTS)], True),  # a street between walls
         ([ground(0.0)], True),  # stated
         ([ground(source="attitude")], True),
-        ([ground(source="pitch", plane=[math.tan(math.radians(MAX_TILT_DEG + 1.0)), 0.0, -1.0])], False),
+        ([ground(source="pitch", plane=[math.tan(math.radians(11.0)), 0.0, -1.0])], False),
         ([ground(), ground(height=1.5, roll=5.0)], True),  # of one vehicle
         ([ground(), ground(height=1.0)], False),
         ([ground(), ground(roll=15.0)], False),

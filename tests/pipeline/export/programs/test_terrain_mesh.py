@@ -14,7 +14,7 @@ from terrain_runs import LATTICE, elevation, finished
 
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import export_run
-from rille.pipeline.export.programs.terrain import UNSEEN_GREY, write_glb
+from rille.pipeline.export.programs.terrain import write_glb
 from rille.pipeline.export.read_dem import read_elevation
 from rille.pipeline.export.writers import Meaning, write_raster
 
@@ -108,7 +108,7 @@ def test_cells_without_an_image_are_grey(tmp_path: Path) -> None:
     look = np.full(KNOWN.shape, np.nan)
     look[KNOWN] = np.where(np.arange(KNOWN.sum()) == 0, 7.0, np.nan)
     write_glb(tmp_path / "a.glb", terrain, look)
-    assert texture(tmp_path / "a.glb").tolist() == [7, UNSEEN_GREY]
+    assert texture(tmp_path / "a.glb").tolist() == [7, 128]
 
 
 def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -> None:
@@ -117,4 +117,4 @@ def test_cells_without_an_image_are_grey_in_a_coloured_run_too(tmp_path: Path) -
     bands[:, 20:25] = 0  # 0 means unknown in the file
     write_raster(run / "ortho.tif", dict(zip(("red", "green", "blue"), bands, strict=True)), LATTICE, Meaning(nodata=0))
     path, _ = exported(run)
-    assert texture(path).tolist() == [90, UNSEEN_GREY]
+    assert texture(path).tolist() == [90, 128]

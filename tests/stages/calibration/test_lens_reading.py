@@ -1,0 +1,54 @@
+"""Coefficients of lenses that are read in another order, or as those of another model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rille.stages.calibration.lens_reading import better_reading
+from rille.stages.calibration.relative_orientation import PointPairs
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.lens import Lens
+
+CAMERA = Camera(450.0, 450.0, 370.0, 240.0, 752, 480)
+RIG = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.003, 0.01, -0.004]), [-0.11, 0.001, 0.002]))
+RADTAN, FISHEYE = (-0.28, 0.07, 0.0002, 0.00002), (0.004, -0.002, 0.002, 0.0005)
+FIVE = (-0.35, 0.18, 0.0005, -0.0003, -0.06)
+
+
+def pairs(true: Lens, given: Lens) -> list[PointPairs]:
+    """Matches of images that one lens took, undistorted by another; with noise, and a tenth of them mismatched."""
+    rng = np.random.default_rng(5)
+    points = CAMERA.rays(rng.uniform((20, 20), (730, 460), (900, 2))) * rng.uniform(1.0, 4.0, (900, 1))
+    ideal = RIG.left.project(points), RIG.right.project(RIG.T_right_left.apply(points))
+    left, right = (given.undistort(true.distort(p, CAMERA) + rng.normal(0, 0.1, p.shape), CAMERA) for p in ideal)
+    right[::10] += rng.uniform(-30, 30, right[::10].shape)
+    seen = np.isfinite(left).all(1) & np.isfinite(right).all(1)
+    return [PointPairs(0, left[seen], right[seen])]
+
+
+@pytest.mark.parametrize(
+    ("true", "given", "name"),
+    [
+        (("radtan", RADTAN), ("radtan", RADTAN), ""),
+        (("fisheye", FISHEYE), ("fisheye", FISHEYE), ""),
+        (("radtan", RADTAN), ("fisheye", RADTAN), "model radtan"),
+        (("fisheye", FISHEYE), ("radtan", FISHEYE), "model fisheye"),
+        (("radtan", FIVE), ("radtan", (-0.35, 0.18, -0.06, 0.0005, -0.0003)), "give k1 k2 p1 p2 k3"),
+        (("none", ()), ("radtan", RADTAN), "free of distortion"),
+        (("radtan", (-0.2, 0.02, 0.0, 0.0)), ("radtan", RADTAN), ""),
+    ],
+)
+def test_another_reading_is_named_where_it_fits_better(true: tuple, given: tuple, name: str) -> None:
+    stated = Lens(CAMERA, *given)
+    said = better_reading(RIG, {"left": stated, "right": stated}, pairs(Lens(CAMERA, *true), stated))
+    assert bool(said) == bool(name)
+    assert name in said
+
+
+def test_a_turned_camera_is_no_other_reading() -> None:
+    lens = Lens(CAMERA, "radtan", RADTAN)
+    knocked = Rig(
+        CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, 0.0, 0.01]) @ RIG.T_right_left.rotation, [-0.11, 0, 0])
+    )
+    assert not better_reading(knocked, {"left": lens, "right": lens}, pairs(lens, lens))
