@@ -25,6 +25,11 @@ KINDS: dict[str, tuple[str, str]] = {
         "python -c \"import sys, cv2, numpy as n; [cv2.imwrite(f[:-3] + 'png', n.load(f)) for f in sys.argv[1:]]\""
         " FILES",
     ),
+    "matrix file": (
+        ".npz .mat .pkl .pickle",
+        "if it is the calibration, write it as text: w = cv2.FileStorage('stereo.yml', 1), w.write('K1', K1), and so "
+        "D1, K2, D2, R, T (MATLAB's K and R transposed)",
+    ),
     "image": (
         ".webp .jp2 .j2k .pbm .pam .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
         "convert them: magick mogrify -format png FILES",

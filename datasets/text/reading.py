@@ -18,6 +18,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
+from rille.datasets.images.kinds import hints
 from rille.stages.core.errors import InputError
 
 SMALL = 1_000_000
@@ -136,7 +137,8 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
         # No text, like a file with zero bytes: both are refused below.
         text = "\0"
     if "\0" in text:
-        raise InputError("RIL-140", f"{what} {path} is no text file", remedy="give it as text in UTF-8")
+        remedy = next(iter(hints(path.name)), "give it as text in UTF-8")
+        raise InputError("RIL-140", f"{what} {path} is no text file", remedy=remedy)
     return text
 
 

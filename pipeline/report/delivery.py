@@ -51,7 +51,7 @@ def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figu
     done = ["every task was done"] if view.tasks and all(t.status in ("computed", "cached") for t in view.tasks) else []
     if view.part:
         absent = [_item("part", f"Left out, as {view.part} asks", left_out(view.left_out))]
-        judged = ("contradiction", *(("no pose", "piece") if view.products.trajectory is not None else ()))
+        judged = ("contradiction", *(("no pose", "piece") if view.bundle(view.products.trajectory) is not None else ()))
         wrong = [item for item in accounted["missing"] if item["kind"] in judged]
         return {"delivered": done, "absent": absent, "missing": [*wrong, *_failures(view), *_unmade(view)]}
     undrawn = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]

@@ -858,6 +858,9 @@ def test_files_that_are_no_text(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
     with raises("RIL-140"):
         read_cameras(tmp_path / "a.png")
+    np.savez(tmp_path / "stereo.npz", K1=np.eye(3))
+    with raises("RIL-140", "cv2.FileStorage"):
+        read_cameras(tmp_path / "stereo.npz")
     with raises("RIL-138"):
         read_cameras(tmp_path / "absent.yaml")
     with raises("RIL-138"):

@@ -444,7 +444,18 @@ def test_names_that_no_manifest_can_hold_are_refused(tmp_path, name):
 
 def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
-    for name in ("a.mp4", "b.mp4", "x.svo2", "d.npy", "left/3.heic", "r.raw", "notes.md", "more.pdf", "drive.bag"):
+    for name in (
+        "a.mp4",
+        "b.mp4",
+        "x.svo2",
+        "d.npy",
+        "left/3.heic",
+        "r.raw",
+        "notes.md",
+        "more.pdf",
+        "drive.bag",
+        "s.npz",
+    ):
         (tmp_path / name).write_bytes(b"")
     write_lines(tmp_path / "readme.txt", ["what this is"])
     (tmp_path / "rig.yaml").write_text("camera_matrix: [1, 2\n")
@@ -457,12 +468,13 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "1 array (d.npy): python -c",
         "1 image (left/3.heic): ",
         "1 bag (drive.bag)",
+        "1 matrix file (s.npz): if it is the calibration, write it as text",
     ):
         assert words in text
     assert "1 headerless image (r.raw): " in text
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
-    assert len(found.unread) == 8
+    assert len(found.unread) == 9
     assert all(f"# Not read: {line}" in manifest_text(found, ".") for line in found.unread)
 
 

@@ -11,6 +11,9 @@ The rig's yaw is an error that all disparities share: near and far landmarks ask
 drive shows that as well, so that all segments count for it, each by what its own common error says. Where one camera
 stands above the other, pitch is that error, and takes its place.
 
+Rows that are read one after the other (a rolling shutter) are of unlike times: what wanders down the image moved for
+longer than what does not. That looks like a wrong rig, which is then left as it is, and named.
+
 A number that the tracks contradict is corrected, and all that rests on it is computed anew: images are undistorted, rig
 and segments found with the corrected calibration, so that poses and maps are of one. An error that does not contradict
 its prior is part of the covariance alone. Held is the baseline's length, which no image shows.
@@ -79,6 +82,11 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
 
+MIN_READ_OUT = 0.3
+"""Time from the first to the last row, in intervals between frames, from which on a rolling shutter is named: of global
+shutters the tracks ask for 0.05 at most, and for 0.25 where the focal length is off by 8 %."""
+
+
 class IntrinsicsParams(Params):
     """Parameters of the stage ``intrinsics``."""
 
@@ -107,12 +115,14 @@ class SegmentCameras(NamedTuple):
 class IntrinsicsPart(NamedTuple):
     """What a segment says of k errors: ``information`` (k, k), ``pull`` (k,); ``by_error`` (frame, 6, k) changes of its
     poses (position m, rotation vector rad of T_local_left) with each. ``yaw``: information and pull of the rig's yaw,
-    rad, by the common error of its disparities, without the prior of that, which would draw it towards zero."""
+    rad, by the common error of its disparities, without the prior of that, which would draw it towards zero.
+    ``read_out``: those of the time from the first to the last row, in intervals between frames."""
 
     information: Floats
     pull: Floats
     by_error: Floats
     yaw: tuple[float, float]
+    read_out: tuple[float, float]
 
 
 def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
@@ -168,6 +178,16 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
     return replace(tracks, landmarks=landmarks, pixels=pixels, camera=other.left)
 
 
+def read_late(tracks: SegmentTracks, cameras: SegmentCameras, time: float) -> SegmentTracks:
+    """Measurements as they would be if the last row were read ``time``, in intervals between frames, later."""
+    key = cameras.rig.left.project(cameras.T_local_key.inverse().apply(tracks.landmarks.position))
+    moved = tracks.pixels - key
+    mean = moved / np.arange(1, len(moved) + 1)[:, None, None]
+    speed = np.diff(tracks.pixels, axis=0, prepend=key[None])
+    speed = np.where(np.isfinite(speed), speed, mean)  # where the frame before does not show it
+    return replace(tracks, pixels=tracks.pixels - time * moved[..., 1:] / cameras.rig.left.height * speed)
+
+
 def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
     """Largest turn of a frame of the segment from its key, degrees."""
     return math.degrees(rigid.angle(state.R @ T_local_key.rotation).max())
@@ -177,9 +197,9 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
     """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
     tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
     *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
-    steps = [replace(problem, tracks=one) for one in changed]
-    p, n = normal.between.shape
-    by_pose, by_depth, squares, gradient = np.zeros((p, k)), np.zeros((k, n)), np.zeros((k, k)), np.zeros(k)
+    steps = [replace(problem, tracks=one) for one in (*changed, read_late(tracks, cameras, STEP))]
+    (p, n), m = normal.between.shape, len(steps)
+    by_pose, by_depth, squares, gradient = np.zeros((p, m)), np.zeros((m, n)), np.zeros((m, m)), np.zeros(m)
     for f in range(len(state.R)):
         errors, others = problem.errors(state, f), [one.errors(state, f) for one in steps]
         usable = np.isfinite([one.norm for one in (errors, *others)]).all(0)
@@ -199,6 +219,14 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
         normal.depth_gradient,
         normal.cost,
     ).without_depths()
+    prior = bias_information(problem.params.bias_sigma)
+    # The time between the rows; all others are free, the bias, too, which is the yaw (10 px), but for the errors of a
+    # usual calibration.
+    free = matrix + np.diag([*np.zeros(p - 1), 0.01 - prior, *IntrinsicsParams().sigma ** -2.0, 0.0])
+    pull = right + prior * state.bias * (np.arange(len(right)) == p - 1)
+    answer = np.linalg.solve(free[:-1, :-1], free[:-1, -1])
+    read_out = float(free[-1, -1] - answer @ free[:-1, -1]), float(pull[-1] - answer @ pull[:-1])
+    matrix, right = matrix[:-1, :-1], right[:-1]
     inverse = np.linalg.inv(matrix[:p, :p])
     step = -inverse @ matrix[:p, p:]
     # Of C = -R^T t and of R^T, by the left perturbation of T_cam_local.
@@ -207,9 +235,8 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
     moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
     along = (moved * ray).sum(1) / (ray**2).sum(1)
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
-    own = max(of_bias - bias_information(problem.params.bias_sigma), 0.0)
-    yaw = own * px_per_rad**2, of_bias * state.bias * px_per_rad
-    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw)
+    yaw = max(of_bias - prior, 0.0) * px_per_rad**2, of_bias * state.bias * px_per_rad
+    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw, read_out)
 
 
 class CommonErrors(NamedTuple):
@@ -293,6 +320,17 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
     )
 
 
+def read_out_contradiction(time: float, sigma: float) -> str:
+    """One line on a time from the first to the last row, in intervals between frames; empty if it is 0."""
+    if not time:
+        return ""
+    return (
+        f"rows of an image are not of one time (rolling shutter): the tracks ask for {time:+.2f} +- {sigma:.2f} "
+        "intervals between frames from the first to the last; path and elevations are distorted, and the rig's yaw is "
+        "not corrected: use global shutters, or stand while images are taken"
+    )
+
+
 def inverse_depth_std(yaw: Sequence[float], baseline: float) -> float:
     """Standard deviation, 1/m, of the error that all inverse depths share, by a yaw that is left and its own, rad.
 
@@ -329,12 +367,19 @@ def intrinsics_stage(
         params.sigma,
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
-    shown = np.array([part["yaw"] for part in parts]).reshape(-1, 2, 1)
-    least = (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal
-    # Any yaw is as likely: drawn to none by a prior, few segments that agree would seem to contradict each other.
-    yaw = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
-    agreed = yaw.wrong[0] and len(parts) >= MIN_YAW_SEGMENTS
-    turn, sigma = float(yaw.errors[0]) if agreed else 0.0, np.sqrt(np.diag(common.covariance))
+
+    def alone(name: str, least: float) -> tuple[CommonErrors, float]:
+        """A number by itself, and its value where enough segments agree that it is not 0."""
+        shown = np.array([part[name] for part in parts]).reshape(-1, 2, 1)
+        # Any is as likely: drawn to 0 by a prior, few segments that agree would seem to contradict each other.
+        found = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
+        return found, float(found.errors[0]) if found.wrong[0] and len(parts) >= MIN_YAW_SEGMENTS else 0.0
+
+    yaw, turn = alone("yaw", (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal)
+    read_out, late = alone("read_out", MIN_READ_OUT)
+    # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
+    late = 0.0 if common.wrong.any() else late
+    turn, sigma = 0.0 if late else turn, np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:
         correction = np.array([*np.zeros(CORRECTED), turn])
@@ -353,8 +398,9 @@ def intrinsics_stage(
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
     angle = yaw_contradiction(off, facts["yaw"][1], epipolar.angle_along(given), fixed=fixed)
-    if doubt := "; ".join(filter(None, [cameras, angle if fixed else ""])):
+    rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0]))
+    if doubt := "; ".join(filter(None, [rows, cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.
-    facts["warnings"] = [] if correction.any() else [line for line in (angle, cameras) if line]
+    facts["warnings"] = [] if correction.any() else [line for line in (rows, angle, cameras) if line]
     return Bundle({}, facts)

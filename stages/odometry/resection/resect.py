@@ -166,6 +166,7 @@ def adjust_segment(
         "pull": (part.pull / errors.excess).tolist(),
         "turn_deg": turn_deg(end.state, cameras.T_local_key),
         "yaw": [one / errors.excess for one in part.yaw],
+        "read_out": [one / errors.excess for one in part.read_out],
         "bias_px": end.state.bias,
     }
 

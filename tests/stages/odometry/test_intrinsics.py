@@ -73,6 +73,28 @@ def segment(
     return tracks, state, SegmentCameras(rig, lenses, LEVEL)
 
 
+def read_row_by_row(seed: int, time: float) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
+    """A segment of a straight drive; the last row is read ``time``, in intervals between frames, after the first."""
+    rng, velocity = np.random.default_rng(seed), np.array([0.02, -0.05, -0.25])
+    X = CAMERA.rays(rng.uniform([60, 40], [690, 440], (POINTS, 2))) * rng.uniform(2.0, 8.0, (POINTS, 1))
+
+    def seen(frame: int, base: RigidTransform):
+        pixels = np.zeros((POINTS, 2))
+        for _ in range(9):
+            at = X + velocity * (frame + time * pixels[:, 1:] / CAMERA.height)
+            pixels = CAMERA.project(base.apply(at))
+        return pixels + 0.1 * rng.standard_normal(pixels.shape)
+
+    rig, still = Rig(CAMERA, CAMERA, T_RIGHT_LEFT), RigidTransform.identity()
+    landmarks = triangulated(seen(0, still), seen(0, T_RIGHT_LEFT), rig, LEVEL, np.full(POINTS, 0.2))
+    pixels = np.array([seen(k, still) for k in (1, 2)])
+    true = [RigidTransform(np.eye(3), velocity * k) @ LEVEL.inverse() for k in (1, 2)]
+    state = SegmentState(
+        np.array([T.rotation for T in true]), np.array([T.translation for T in true]), np.zeros(POINTS)
+    )
+    return SegmentTracks(landmarks, pixels, np.ones((2, POINTS), bool), CAMERA), state, SegmentCameras(rig, {}, LEVEL)
+
+
 def facts_of(
     given: Camera,
     lens: Lens,
@@ -85,13 +107,16 @@ def facts_of(
 ):
     """Facts that segments lead to, of a camera that is given, and of a rig that is off by a yaw; it may have been
     ``changed`` before."""
+    return facts_from([segment(seed, given, lens, turn, yaw, base) for seed in range(segments)], turn, changed, **known)
+
+
+def facts_from(segments, turn: float = 0.0, changed: bool = False, **known):
+    """The same of given segments that turn by some radians."""
     parts = []
-    for seed in range(segments):
-        tracks, state, cameras = segment(seed, given, lens, turn, yaw, base)
+    for tracks, state, cameras in segments:
         end = adjust(tracks, state, PARAMS).state
         part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
-        facts = {"information": part.information, "pull": part.pull, "turn_deg": 57.3 * turn, "yaw": part.yaw}
-        parts.append(Bundle({}, {"intrinsics": facts}))
+        parts.append(Bundle({}, {"intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}}))
     rig = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": changed})
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
@@ -157,6 +182,16 @@ def test_a_yaw_is_kept_where_the_rig_is_fixed():
     facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.003, fixed=True)
     assert not any(facts["correction"])
     assert "kept because rig.mode = fixed" in facts["contradiction"]
+
+
+@pytest.mark.parametrize("time", [0.9, 0.5, -0.6, 0.0])
+def test_rows_of_unlike_times_are_named_and_no_rig_is_repaired(time):
+    facts = facts_from([read_row_by_row(seed, time) for seed in range(5)])
+    assert not any(facts["correction"])
+    assert ("rolling shutter" in facts.get("contradiction", "")) == bool(time)
+    assert [line for line in facts["warnings"] if "rolling shutter" not in line] == []
+    if time:
+        assert float(facts["contradiction"].split("ask for ")[1].split()[0]) == pytest.approx(time, rel=0.3)
 
 
 def test_a_yaw_below_half_a_pixel_passes():
@@ -239,3 +274,12 @@ def test_two_corrections_one_after_the_other_are_one():
     camera = Camera(450.0, 430.0, 375.5, 239.5, 752, 480)
     twice, once = corrected(corrected(camera, first), second), corrected(camera, composed(first, second))
     np.testing.assert_allclose(twice.matrix, once.matrix, rtol=1e-12)
+
+
+def test_a_camera_at_rest_tells_no_time_between_its_rows():
+    tracks, state, cameras = read_row_by_row(1, 0.0)
+    here = CAMERA.project(LEVEL.inverse().apply(tracks.landmarks.position))
+    at = LEVEL.inverse()
+    state = state._replace(R=np.array([at.rotation] * 2), t=np.array([at.translation] * 2))
+    part = contribution(SegmentAdjustment(replace(tracks, pixels=np.array([here, here])), PARAMS), state, cameras)
+    assert part.read_out == pytest.approx((0.0, 0.0), abs=1.0)  # standard deviation of an interval at least
