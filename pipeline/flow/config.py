@@ -38,6 +38,10 @@ OF_BOTH: dict[str, Any] = {"locus": {"refined_share": 0.5}}
 """What it sets besides where the matcher is accurate: the mean of what the disparity says and of what the images show
 is better than either."""
 
+OF_FAST: dict[str, Any] = {"locus": {"refine_steps": 6}}
+"""What ``hfvm.preset = "fast"`` sets besides: its disparities err more, and two steps take less of that away (errors of
+merged elevations of three beds .87 to .91 times those after two, within one standard deviation .68 instead of .56)."""
+
 NAVIGATION: dict[str, Any] = {
     "hfvm": {"preset": "fast"},
     "motion": {"level": 3},
@@ -215,6 +219,8 @@ def build(*layers: Mapping[str, Any]) -> Params:
         nested = _beneath(nested, ACCURATE_TERRAIN)
         if _preset(nested, "hfvm") == "accurate":
             nested = _beneath(nested, OF_BOTH)
+    if _preset(nested, "hfvm") == "fast":
+        nested = _beneath(nested, OF_FAST)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
     return validate(model(), nested, also=DATASET_SECTIONS)

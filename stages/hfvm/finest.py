@@ -77,7 +77,7 @@ def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
 def nearest(a: AnyArray, there: Map) -> AnyArray:
     """Values (row, col) of ``a`` at the pixels nearest to where displacements lead; of its border beyond it."""
     y, x = np.indices(there.u.shape, np.float32)
-    return cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
 
 
 @njit(cache=True, nogil=True)

@@ -22,6 +22,14 @@ def test_layers_win_in_order() -> None:
     assert built.keyframes.stride == 5
 
 
+def test_fast_matches_are_refined_by_more_steps_unless_others_are_given() -> None:
+    steps = [
+        config.build({"hfvm": {"preset": "fast"}}, {"locus": locus}).locus.refine_steps
+        for locus in ({}, {"refine_steps": 2})
+    ]
+    assert [*steps, config.build().locus.refine_steps] == [6, 2, 2]
+
+
 def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -> None:
     plain = config.build()
     assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
