@@ -216,9 +216,8 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     laid = yield Maybe(prints)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
     if not footprints:
-        raise DegenerateError(
-            "RIL-051", "no elevation model has a cell in the world", remedy="look at the disparities' validity"
-        )
+        remedy = "set locus.cell_size greater, or look at the disparities' validity"
+        raise DegenerateError("RIL-051", "no elevation model has a cell in the world", remedy=remedy)
 
     # Seams are audited, exposures levelled, models merged in world tiles; then hazards and the path over all of it.
     p.seams = overlaps(make, footprints)
