@@ -72,9 +72,9 @@ def _without_texture(result: Any) -> str:
 
 def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
     """That displacements of the matches that are ``ok`` are those of a left image taken for the right one."""
-    from rille.stages.hfvm import given
+    from rille.stages.hfvm import doubt
 
-    if not given.swapped(result.column_disparity, result.row_disparity, ok):
+    if not doubt.swapped(result.column_disparity, result.row_disparity, ok):
         return ""
     median = float(np.median(result.column_disparity[ok]))
     text = (
@@ -86,19 +86,19 @@ def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
 
 def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any], ok: NDArray[np.bool_]) -> Iterator[str]:
     """That matches which are ``ok`` contradict each other, or could as well be others."""
-    from rille.stages.hfvm import given
+    from rille.stages.hfvm import doubt
 
-    judged = given.judge(left, right, result, ok)
+    judged = doubt.judge(left, right, result, ok)
     if judged is None:
         return
     on_lines, repeated = judged
-    if on_lines < given.MIN_RIGID_SHARE:
+    if on_lines < doubt.MIN_RIGID_SHARE:
         text = (
             f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
             "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
         )
         yield warning("RIL-703", text)
-    if repeated > given.MAX_REPEATED_SHARE:
+    if repeated > doubt.MAX_REPEATED_SHARE:
         text = (
             f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
             "pattern they may be off by a period: look at them first"

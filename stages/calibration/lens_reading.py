@@ -44,12 +44,16 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
         at = {s: by[s].undistort(lenses[s].distort(points[s], ideal[s]), ideal[s]) for s in ideal}
         return float(np.nanmedian(np.abs(distances(rig, np.zeros(RIG), *at.values())[0])))
 
-    given, other = off(lenses), {side: readings(lens) for side, lens in lenses.items()}
+    given = off(lenses)
+    # 0.3 px: more than a good calibration leaves.
+    if given < 0.3:
+        return ""
+    other = {side: readings(lens) for side, lens in lenses.items()}
     names = {name: None for found in other.values() for name in found}
-    both = {name: off({s: other[s].get(name, lenses[s]) for s in ideal}) for name in names if given >= 0.3}
+    both = {name: off({s: other[s].get(name, lenses[s]) for s in ideal}) for name in names}
     name, least = min(both.items(), key=lambda item: item[1], default=("", given))
-    # 0.3 px: more than a good calibration leaves. Half of it: no reading is so much better by chance.
-    if given < 0.3 or least > min(0.5 * given, 0.3):
+    # Half of it: no reading is so much better by chance.
+    if least > min(0.5 * given, 0.3):
         return ""
     return (
         "the coefficients of the lenses seem misread: the matches lie "

@@ -21,7 +21,7 @@ from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
 from rille.stages.geometry.epipolar import NAMES, corrected, distances, image_turn
 from rille.stages.geometry.geometry import Rig
-from rille.stages.hfvm.given import lines, repeated
+from rille.stages.hfvm.doubt import lines, repeated
 
 
 class OrientationParams(Params):

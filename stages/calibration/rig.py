@@ -53,7 +53,7 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
-from rille.stages.hfvm.given import MAX_REPEATED_SHARE
+from rille.stages.hfvm.doubt import MAX_REPEATED_SHARE
 from rille.stages.numeric.robust import mad_sigma
 
 

@@ -1,7 +1,7 @@
-"""Whether to believe disparities: pixel by pixel those that another program made, and matches as a whole.
+"""Whether to believe disparities that another program made, pixel by pixel.
 
-**Another program's** are checked against the images. Columns are the other program's. A pixel counts as matched if it
-passes the matcher's own checks: feature distance, the way back, correlation of the windows, size of its patch
+They are checked against the images. Columns are the other program's. A pixel counts as matched if it passes the
+matcher's own checks: feature distance, the way back, correlation of the windows, size of its patch
 (:mod:`~rille.stages.hfvm.finest`). The way back is matched in the right image itself, at the finest level, from the map
 as the right camera sees it: where a depth edge lies too far out, or a hidden pixel has its neighbour's disparity, the
 right image leads elsewhere. In SGBM's maps without its own checks .105 of the pixels with truth of Middlebury's chosen
@@ -10,31 +10,17 @@ way back .040 and .035 did.
 
 A map of disparities says nothing of rows; the images do. How far refinement would move a column is part of the standard
 deviation: 65 and 89 % of the matched pixels of the chosen half err by at most one and two of it, 61 and 86 % of the
-judged half; without this part 60 and 86, 56 and 82. 2026-11-26.
-
-**Matches as a whole** deserve doubt by two signs, which images show without calibration, each a share of a sample of
-the matches: those far from every epipolar line, as no rigid scene has them; and those that look as well elsewhere along
-their line, as on a repeating pattern, where each match may be off by a period.
-
-With the right camera on the right, nothing has a column displacement greater than infinitely far things have (right
-minus left). Without calibration that of far things is not known: cameras that converge by an angle t move them by
-D = f t. But they also make a keystone, a row displacement (t / f) x y about the image's middle, which matches show.
-The focal length f is between half and three times the image width, so D is k f^2 with k = t / f within bounds. Images
-are swapped for certain where nearly all displacements lie beyond the upper one."""
+judged half; without this part 60 and 86, 56 and 82. 2026-11-26."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
-from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.coarse import (
     MIN_LOG_RATIO,
@@ -46,14 +32,12 @@ from rille.stages.hfvm.coarse import (
     ratio_of_matches,
 )
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import as_matched, thinned
+from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.numeric.least_squares import irls
-from rille.stages.numeric.robust import cauchy
 
 
 def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
@@ -107,148 +91,3 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)
         arrays["disparity_std"] = np.where(stated, given["disparity_std"], arrays["disparity_std"])
     return Bundle(arrays, facts(arrays, params, False, int(np.count_nonzero(a.valid[0]))))
-
-
-MIN_MATCHES = 100
-"""Matches that a judgement needs at least."""
-
-PATCH_RADIUS_PX = 8
-"""Pixels: half side of a patch."""
-
-SEARCH_REACH_PX = 64
-"""Pixels: how far from its match a likeness is sought."""
-
-MIN_RIGID_SHARE = 0.75
-"""Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
-.82; photographs of a chess board, matched in part, .71 to .97."""
-
-MAX_REPEATED_SHARE = 0.5
-"""Share of matches that look as well elsewhere above which a pair is doubtful. Right pairs reach .34, a board .86."""
-
-Places = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Shares of the matches that lie on their lines, and that look as well elsewhere; None: too few to tell.
-
-    Parameters
-    ----------
-    left, right : (row, col) grey images.
-    disparity : their :class:`~rille.stages.hfvm.stage.StereoMatches`; ``matched`` (row, col): which of it to judge.
-    """
-    places = sample(disparity.column_disparity, disparity.row_disparity, matched)
-    if places is None:
-        return None
-    f = lines(places)
-    return on_their_lines(places, f), repeated(left, right, places, f)
-
-
-def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Places | None:
-    """Evenly spread matches: left and right pixels (n, 2), column and row; None where there are too few."""
-    # 2000: matches that the lines are fitted to.
-    y, x = thinned(matched, 2000)
-    if len(y) < MIN_MATCHES:
-        return None
-    left = np.stack([x, y], 1).astype(np.float64)
-    return left, left + np.stack([column[y, x], row[y, x]], 1)
-
-
-def lines(places: Places) -> NDArray[np.float64] | None:
-    """Fundamental matrix that most matches agree on; None where there is none."""
-    f, _ = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, 0.5 * MAX_LINE_DISTANCE_PX, 0.999, 5000)
-    return None if f is None or f.shape != (3, 3) else np.asarray(f, np.float64)
-
-
-def on_their_lines(places: Places, f: NDArray[np.float64] | None) -> float:
-    """Share of the matches that lie near their epipolar line; 0 where there are no lines."""
-    if f is None:
-        return 0.0
-    ones = np.ones((len(places[0]), 1))
-    line = np.hstack([places[0], ones]) @ f.T
-    distance = np.abs(np.sum(line * np.hstack([places[1], ones]), axis=1)) / np.hypot(line[:, 0], line[:, 1])
-    return float(np.mean(distance <= MAX_LINE_DISTANCE_PX))
-
-
-def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.float64] | None) -> float:
-    """Share of the matches that look as well elsewhere on their epipolar line; 0 where too few patches say anything.
-
-    Parameters
-    ----------
-    left, right : (row, col) grey images.
-    """
-    a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
-    keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
-    chosen = np.flatnonzero(keep)
-    chosen = chosen[:: -(-len(chosen) // 150) or 1]
-    looks_alike = []
-    for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
-        patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]
-        y0, x0 = max(q - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0), max(p - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0)
-        around = b[y0 : q + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1, x0 : p + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1]
-        score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-        j, i = np.indices(score.shape)
-        j, i = j + y0 + PATCH_RADIUS_PX, i + x0 + PATCH_RADIUS_PX
-        # The match has been rounded, so that its peak may lie beside it.
-        own = float(score[np.hypot(j - q, i - p) <= 2].max())
-        # 0.7: least correlation of a match whose patch says anything.
-        if not np.isfinite(own) or own < 0.7:
-            continue
-        # Without lines the row through the match stands in.
-        line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
-        here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
-        # 8 pixels: how far from its match a likeness counts.
-        elsewhere = score[here & (np.hypot(j - q, i - p) >= 8)]
-        # 0.05: by how much less than the match a likeness may correlate.
-        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
-    return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
-
-
-def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
-    last = np.array([shape[1] - 1 - margin, shape[0] - 1 - margin])
-    return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
-
-
-def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool:
-    """Whether left and right image of a stereo rig must have been swapped; False also where nobody can know.
-
-    Parameters
-    ----------
-    column, row : (row, col) disparities, pixels, right minus left.
-    matched : (row, col) bool, which to trust.
-    """
-    places = sample(column, row, matched)
-    if places is None:
-        return False
-    (x, y), (u, v) = places[0].T, (places[1] - places[0]).T
-    width = matched.shape[1]
-    k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
-    # In units of the image width k is D in pixels for a focal length of one width.
-    most = k + 3.0 * sigma
-    # Fields of view of 90 and 19 degrees: .5 and 3 image widths. A keystone may be negative: then the short focal
-    # length gives the upper bound.
-    bound = max(most * 0.5**2, most * 3.0**2)
-    # Nearly all have to lie beyond the bound, and a pixel beyond it proves nothing.
-    return bool(np.percentile(u, 10.0) > bound + 1.0)
-
-
-def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float, float]:
-    """Factor of x y in the row displacements, pixels, and its standard deviation, robustly (Cauchy weights).
-
-    Other terms: row offset, roll, scale, relative pitch, baseline across the rows, one camera before the other.
-    """
-    depth = (u - u.mean()) / max(float(u.std()), 1e-6)
-    terms = np.stack([x * y, np.ones_like(x), x, y, y * y, depth, depth * y], -1)
-    spread = 1e-3
-
-    def weigh(residual: AnyArray) -> AnyArray:
-        # Rows that agree exactly leave residuals of zero to divide by.
-        nonlocal spread
-        spread = max(1.5 * float(np.median(np.abs(residual))), 1e-3)
-        return cauchy(residual, spread)
-
-    # A flat scene has no depth, whose terms are zero: without a hold the matrix would be singular.
-    hold = 1e-9 * len(x) * np.eye(terms.shape[1])
-    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), rounds=8)
-    weight = weigh(terms @ solution - v)
-    normal = (terms * weight[:, None]).T @ terms + hold
-    return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

@@ -220,12 +220,7 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
         normal.cost,
     ).without_depths()
     prior = bias_information(problem.params.bias_sigma)
-    # The time between the rows; all others are free, the bias, too, which is the yaw (10 px), but for the errors of a
-    # usual calibration.
-    free = matrix + np.diag([*np.zeros(p - 1), 0.01 - prior, *IntrinsicsParams().sigma ** -2.0, 0.0])
-    pull = right + prior * state.bias * (np.arange(len(right)) == p - 1)
-    answer = np.linalg.solve(free[:-1, :-1], free[:-1, -1])
-    read_out = float(free[-1, -1] - answer @ free[:-1, -1]), float(pull[-1] - answer @ pull[:-1])
+    read_out = _of_read_out(matrix, right, prior, state.bias)
     matrix, right = matrix[:-1, :-1], right[:-1]
     inverse = np.linalg.inv(matrix[:p, :p])
     step = -inverse @ matrix[:p, p:]
@@ -237,6 +232,19 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
     yaw = max(of_bias - prior, 0.0) * px_per_rad**2, of_bias * state.bias * px_per_rad
     return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw, read_out)
+
+
+def _of_read_out(matrix: Floats, right: Floats, prior: float, bias: float) -> tuple[float, float]:
+    """Information and pull of the last unknown, the time between the rows: poses and the bias before the errors of
+    :data:`PRIORS` are free, the bias without the ``prior`` of its own, for it is the yaw."""
+    k = len(PRIORS) + 1
+    # The errors are those of a usual calibration, the bias one of 10 px.
+    hold = np.zeros(len(right))
+    hold[-k - 1 : -1] = [0.01 - prior, *IntrinsicsParams().sigma ** -2.0]
+    free, pull = matrix + np.diag(hold), right.copy()
+    pull[-k - 1] += prior * bias
+    answer = np.linalg.solve(free[:-1, :-1], free[:-1, -1])
+    return float(free[-1, -1] - answer @ free[:-1, -1]), float(pull[-1] - answer @ pull[:-1])
 
 
 class CommonErrors(NamedTuple):

@@ -9,8 +9,8 @@ from raising import raises
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
 from rille.stages.hfvm import coarse
+from rille.stages.hfvm.doubt import swapped
 from rille.stages.hfvm.finest import isolated
-from rille.stages.hfvm.given import swapped
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match

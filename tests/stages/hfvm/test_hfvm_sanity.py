@@ -6,7 +6,7 @@ from matching_scenes import Texture, convergent_rig, pair, rig_displacement
 
 from rille.pipeline.runs.doubts import doubts
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import given
+from rille.stages.hfvm import doubt
 from rille.stages.hfvm.stage import match
 
 
@@ -41,11 +41,11 @@ def test_too_few_matches_are_not_judged():
     y, x = np.indices((140, 180), dtype=np.float64)
     left, right = Texture(0)(x, y), Texture(1)(x, y)
     found = match(left, right)
-    assert given.judge(left, right, found, matched(found.validity)) is None
+    assert doubt.judge(left, right, found, matched(found.validity)) is None
 
 
 def test_lines_of_an_exact_geometry_hold_all_matches():
     _, _, u, v = pair(rig_displacement(convergent_rig(), lambda x, y: 1.5 + 0.3 * np.sin(x / 25)))
-    places = given.sample(u, v, np.ones(u.shape, bool))
-    assert given.on_their_lines(places, given.lines(places)) > 0.99
-    assert given.on_their_lines(places, None) == 0.0
+    places = doubt.sample(u, v, np.ones(u.shape, bool))
+    assert doubt.on_their_lines(places, doubt.lines(places)) > 0.99
+    assert doubt.on_their_lines(places, None) == 0.0
