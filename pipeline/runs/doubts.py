@@ -72,7 +72,7 @@ def _without_texture(result: Any) -> str:
 
 def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
     """That displacements of the matches that are ``ok`` are those of a left image taken for the right one."""
-    from rille.stages.hfvm import doubt
+    from rille.stages.calibration import doubt
 
     if not doubt.swapped(result.column_disparity, result.row_disparity, ok):
         return ""
@@ -86,7 +86,7 @@ def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
 
 def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any], ok: NDArray[np.bool_]) -> Iterator[str]:
     """That matches which are ``ok`` contradict each other, or could as well be others."""
-    from rille.stages.hfvm import doubt
+    from rille.stages.calibration import doubt
 
     judged = doubt.judge(left, right, result, ok)
     if judged is None:

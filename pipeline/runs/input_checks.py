@@ -16,13 +16,13 @@ import numpy as np
 
 from rille.datasets.protocol import Positions, Rows
 from rille.datasets.text.count import count
+from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.core.arrays import Floats
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between, lengths_along
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
-from rille.stages.hfvm.doubt import MAX_REPEATED_SHARE
 from rille.stages.imaging.image_quality import grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 from rille.stages.terrain.reference import camera_height

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from rille.stages.calibration.doubt import lines, repeated
 from rille.stages.calibration.parameter_selection import ANGLES, RelativeParams
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, RIG, PointPairs, rms, settle
 from rille.stages.core.arrays import Bools, Floats
@@ -21,7 +22,6 @@ from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
 from rille.stages.geometry.epipolar import NAMES, corrected, distances, image_turn
 from rille.stages.geometry.geometry import Rig
-from rille.stages.hfvm.doubt import lines, repeated
 
 
 class OrientationParams(Params):

@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from pydantic import Field
 
+from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.calibration.lens_reading import better_reading
 from rille.stages.calibration.parameter_selection import (
     BEYOND_SHARE,
@@ -53,7 +54,6 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.geometry.sides import refuse_impossible
-from rille.stages.hfvm.doubt import MAX_REPEATED_SHARE
 from rille.stages.numeric.robust import mad_sigma
 
 

@@ -10,7 +10,7 @@ the method on one page, in the order of the paper, and each preset as a list of 
 - ``finest``: the finest level, window by window; ``refinement`` of displacements, and their standard deviations;
   ``textureless``: planes.
 - ``tile_stage``, ``join_stage``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to
-  believe another program's disparities; ``doubt``: matches as a whole.
+  believe another program's disparities.
 """
 
 from __future__ import annotations

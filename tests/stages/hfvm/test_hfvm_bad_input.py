@@ -6,10 +6,10 @@ import pytest
 from matching_scenes import convergent_rig, pair, rig_displacement, seen
 from raising import raises
 
+from rille.stages.calibration.doubt import swapped
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
 from rille.stages.hfvm import coarse
-from rille.stages.hfvm.doubt import swapped
 from rille.stages.hfvm.finest import isolated
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
