@@ -28,7 +28,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
-from rille.stages.hfvm.level import PyramidPair, State, descend, sample, textured
+from rille.stages.hfvm.level import FREE_BAND, PyramidPair, State, descend, sample, textured
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -243,8 +243,13 @@ class Coarse:
 
     @property
     def share(self) -> float:
-        """Share of the left image's pixels with texture that are consistent."""
-        told = textured(self.images.left.layers[self.state.level], self.images.params)
+        """Share of the left image's pixels with texture that are consistent; of those that the right image sees, where
+        it is aligned."""
+        left, level = self.images.left, self.state.level
+        told = textured(left.layers[level], self.images.params)
+        if self.alignment is not None:
+            rows, cols = (slice(m := plane.margin(left.shapes[0]) >> level, m + n) for n in told.shape)
+            told &= self.images.right.layers[level].valid[rows, cols] != 0
         return float(np.mean(self.state.left_ok[told])) if told.any() else 0.0
 
     def with_threads(self, threads: int) -> Coarse:
@@ -256,10 +261,20 @@ class Coarse:
         right = self.right if self.alignment is None else plane.aligned(self.right, self.alignment, self.images.left)
         return replace(self, images=replace(self.images, right=right))
 
-    def anew(self, **changed: Any) -> Coarse:
-        """Coarse levels of the images with another ``ratio`` or ``alignment``."""
+    def anew(self, covering: bool = False, **changed: Any) -> Coarse:
+        """Coarse levels of the images with another ``ratio`` or ``alignment``; ``covering``: by which they are known to
+        lie on each other."""
         other = replace(self, **changed).seen()
-        return replace(other, state=descend(other.images, COARSE_LEVEL, None, other.state.near_sign))
+        above = still(other.images) if covering else None
+        return replace(other, state=descend(other.images, COARSE_LEVEL, above, other.state.near_sign))
+
+
+def still(images: PyramidPair) -> State:
+    """State above the top in which the right image, which was aligned, lies on the left one."""
+    level, by = images.levels, plane.margin(images.left.shapes[0]) >> images.levels
+    a, b = (tuple((n + 1) // 2 for n in image.shapes[level - 1]) for image in (images.left, images.right))
+    left, right = Map(*np.full((2, *a), by, np.int16)), Map(*np.full((2, *b), -by, np.int16))
+    return State(level, left, right, np.ones(a, bool), np.ones(b, bool), FREE_BAND, 0.0)
 
 
 def even(coarse: Coarse) -> Coarse:
@@ -314,10 +329,11 @@ def turn(coarse: Coarse) -> Coarse:
         return coarse
     # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
-    turned = upright.anew(alignment=h)
+    # The right image may show a part of the left one, or the other way round: coarse levels would find chance there.
+    turned = upright.anew(covering=True, alignment=h)
     # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
     h = plane.refitted(sample(turned.images, turned.state), turned.state.level, left.shapes, h)
-    again = turned if h is None else upright.anew(alignment=h)
+    again = turned if h is None else upright.anew(covering=True, alignment=h)
     return max(coarse, turned, again, key=lambda tried: tried.share)
 
 

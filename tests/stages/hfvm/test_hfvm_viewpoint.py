@@ -28,7 +28,8 @@ def turned(degrees, scale=1.0, slant=0.0):
 
 
 @pytest.mark.parametrize(
-    ("degrees", "scale", "slant"), [(60, 1.0, 0.0), (180, 1.0, 0.0), (-120, 1.0, 0.3), (35, 1.3, 0.0), (0, 0.6, 0.0)]
+    ("degrees", "scale", "slant"),
+    [(60, 1.0, 0.0), (180, 1.0, 0.0), (-120, 1.0, 0.3), (35, 1.3, 0.0), (30, 2.2, 0.0), (0, 3.0, 0.0), (0, 0.6, 0.0)],
 )
 def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     left, right, u, v = turned(degrees, scale, slant)
@@ -37,10 +38,30 @@ def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     error = np.hypot(found.column_disparity - u, found.row_disparity - v)
     assert found.aligned
     assert np.mean(matched(found.validity)[both]) > 0.9
-    assert np.median(error[both & matched(found.validity)]) < 0.1
+    # In pixels of the right image, of which one of the left one is as many wide.
+    assert np.median(error[both & matched(found.validity)]) < 0.1 * max(scale, 1.0)
     # What was interpolated follows the turned surface, too.
     assert np.mean(error[both] < 1) > 0.97
     assert np.mean(matched(match(left, right, HfvmParams(without=("turn",))).validity)) < 0.02
+
+
+@pytest.mark.parametrize(("left_px", "right_px"), [(3.0, 4.2), (3.0, 7.2)])
+def test_texture_as_fine_as_pixels_is_found_in_views_of_other_scale(left_px, right_px):
+    # Means over squares of so many cells of noise without long waves: no level shows what another one does.
+    side, cells = 300, 2160
+    grey = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 400, (cells, cells)).astype(np.float32), None, 2.5)
+    ends = [int(side * px) for px in (left_px, right_px)]
+    parts = [grey[(k := (cells - end) // 2) : k + end, k : k + end] for end in ends]
+    left, right = (cv2.resize(part, (side, side), interpolation=cv2.INTER_AREA) for part in parts)
+    x = np.arange(side)
+    there = ((x + 0.5) * left_px + (ends[1] - ends[0]) / 2) / right_px - 0.5
+    u, v = np.broadcast_arrays(there - x, (there - x)[:, None])
+    found = match(left, right)
+    both = seen(u, v, right.shape, 12)
+    error = np.hypot(found.column_disparity - u, found.row_disparity - v)
+    assert found.aligned
+    assert np.mean((matched(found.validity) & (error < 1))[both]) > 0.6
+    assert np.mean(error[both] < 1) > 0.95
 
 
 @pytest.mark.parametrize("degrees", [90, 150])
