@@ -11,6 +11,7 @@ result of the pair matched in one window: tiles do not see patches and propagati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -25,7 +26,7 @@ from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
 from rille.stages.hfvm import epipolar, plane, refinement, textureless
 from rille.stages.hfvm.coarse import Coarse
-from rille.stages.hfvm.image import Layer, Shape, Window, thinned, whole
+from rille.stages.hfvm.image import Image, Layer, Shape, Window, thinned, whole
 from rille.stages.hfvm.level import (
     MAX_FIT_MATCHES,
     NEAR_SIGN,
@@ -140,7 +141,8 @@ class FinestWork:
 
     ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
     from the one to the other, is given. ``left, back``: whole displacements of the left window in that of ``b``, and
-    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.level.State`.
+    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.level.State`; ``blur``:
+    :func:`rille.stages.hfvm.coarse.focus`.
     """
 
     a: Layer
@@ -151,6 +153,12 @@ class FinestWork:
     images: PyramidPair
     alignment: plane.Matrix | None = None
     upright: bool = False
+    blur: tuple[float, float] = (0.0, 0.0)
+
+    def alike(self) -> FinestWork:
+        """The same with the detail that both images show."""
+        left, right = self.blur
+        return replace(self, a=self.a.blurred(left), b=self.b.blurred(right), right=self.right.blurred(right))
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Displacements in the window of the right image, of those in the window of ``b``."""
@@ -238,21 +246,24 @@ def check(work: FinestWork, fine: Fine) -> Fine:
 
 def refine(work: FinestWork, fine: Fine) -> Fine:
     """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
-    keep = fine.keep
+    keep, work = fine.keep, work.alike()
     # An image that a plane has aligned is sheared, and takes a step more.
     how = 1 if work.alignment is None else 2, work.upright
     u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
     removed = work.images.left.noise**2, work.images.right.noise**2
     deviations = work.a.deviation, nearest(work.b.deviation, Map(u, v))
     alike, variance = refinement.surroundings(rest, deviations, keep, removed)
-    # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better.
-    noise = per_noise * (variance * np.float32(9) if any(removed) else variance)
+    # Denoising takes means of nine pixels, blurring of 4 pi b^2; the residuals have as many times less variance, and no
+    # match is placed better.
+    pixels = (9.0 if any(removed) else 1.0) * (1.0 + 4.0 * math.pi * max(work.blur) ** 2)
+    noise = per_noise * (variance * np.float32(pixels))
     validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)
     return replace(fine, u=u, v=v, noise=noise, validity=validity)
 
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
     """A piecewise smooth relief fitted to all matches along their epipolar lines."""
+    work = work.alike()
     u, v = work.from_right(*refinement.fit_relief(work.compared(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
@@ -371,10 +382,15 @@ def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     outer = window.grow(HALO_PX, HALO_PX, shape)
     state, target = _around(pair, outer)
     a, b = images.left.cut(outer), images.right.cut(target)
+    # 1.1: pixels of blur up to which features bear it better than the loss of detail.
+    if max(pair.blur) >= 1.1:
+        a, b = (Image((k.layers[0].blurred(s),), k.noise) for k, s in zip((a, b), pair.blur, strict=True))
     if state.level > 0:
         state = match_level(replace(images, left=a, right=b), 0, state)  # 4.3.4: search, propagate, check, band
     left, right = a.layers[0], b.layers[0]
-    work = FinestWork(left, right, right, state.left, state.right, images, pair.alignment, pair.state.upright)
+    work = FinestWork(
+        left, right, right, state.left, state.right, images, pair.alignment, pair.state.upright, pair.blur
+    )
     if pair.alignment is not None:
         work = replace(work, right=pair.right.layers[0].cut(_landing(work, pair.right.shapes[0])))
     result = subpixel(work)  # 4.3.2

@@ -297,12 +297,14 @@ Grey = tuple[AnyArray, AnyArray]
 
 @dataclass(frozen=True)
 class Layer:
-    """A level of an image, or a window of it. ``read``: grey values of any window; ``shape``: of the level."""
+    """A level of an image, or a window of it. ``read``: grey values of any window; ``shape``: of the level; ``blur``:
+    standard deviation of a Gaussian that it is seen through, pixels."""
 
     read: Callable[[Window], Grey]
     shape: Shape
     weights: Weights
     window: Window
+    blur: float = 0.0
 
     @staticmethod
     def of(read: Callable[[Window], Grey], shape: Shape, weights: Weights) -> Layer:
@@ -312,6 +314,15 @@ class Layer:
     def cut(self, window: Window) -> Layer:
         """A window of the level."""
         return replace(self, window=window)
+
+    def blurred(self, deviation: float) -> Layer:
+        """The same seen through a Gaussian, ``deviation`` in pixels; itself where it is already."""
+
+        def read(window: Window) -> Grey:
+            grey, mask = self.read(window)
+            return np.asarray(cv2.GaussianBlur(grey, None, deviation)), mask
+
+        return self if deviation == self.blur else replace(self, read=read, blur=deviation)
 
     @cached_property
     def _both(self) -> Grey:

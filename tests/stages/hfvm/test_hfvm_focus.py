@@ -1,0 +1,78 @@
+"""A camera that is out of focus: its image shows less detail than the other one's."""
+
+import cv2
+import numpy as np
+import pytest
+from matching_scenes import seen
+
+from rille.stages.core.validity import matched
+from rille.stages.hfvm import coarse
+from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.stage import match
+
+SHAPE = (220, 300)
+
+
+def views(blur_left=0.0, blur_right=0.0, noise=1.0):
+    """Fine texture and coarse one on a slope, each image blurred by its camera before its own noise is added."""
+    rng = np.random.default_rng(2)
+    scene = sum(
+        k * cv2.resize(rng.normal(size=(300 // k, 400 // k)), (400, 300), interpolation=cv2.INTER_CUBIC)
+        for k in (1, 2, 4, 8, 16)
+    )
+    y, x = np.indices(SHAPE, dtype=np.float32)
+    u = -8.0 - 0.03 * y
+    right = (128 + 5 * scene[: SHAPE[0], : SHAPE[1]]).astype(np.float32)
+    left = cv2.remap((128 + 5 * scene).astype(np.float32), x + u, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    out = []
+    for image, blur in ((left, blur_left), (right, blur_right)):
+        soft = cv2.GaussianBlur(image, None, blur) if blur else image
+        out.append(np.clip(soft + rng.normal(0, noise, SHAPE), 0, 255).astype(np.float32))
+    return *out, u
+
+
+def found_blur(monkeypatch, left, right):
+    """What the matcher takes the blur of the left and the right image to be missing."""
+    seen_blur, focus = [], coarse.focus
+
+    def told(pair):
+        out = focus(pair)
+        seen_blur.append(out.blur)
+        return out
+
+    monkeypatch.setattr(coarse, "focus", told)
+    match(left, right)
+    return seen_blur[-1]
+
+
+@pytest.mark.parametrize("blur", [1.2, 2.0, 3.0])
+@pytest.mark.parametrize("left", [True, False])
+def test_the_sharper_image_is_blurred_as_the_other_one_is(monkeypatch, blur, left):
+    a, b, _ = views(*((blur, 0.0) if left else (0.0, blur)))
+    of_left, of_right = found_blur(monkeypatch, a, b)
+    assert (of_left, of_right)[left] == pytest.approx(blur, rel=0.15)
+    assert (of_left, of_right)[not left] == 0
+
+
+@pytest.mark.parametrize("both", [0.0, 2.0])
+def test_images_alike_stay_as_they_are(monkeypatch, both):
+    a, b, _ = views(both, both)
+    assert found_blur(monkeypatch, a, b) == (0.0, 0.0)
+
+
+def test_images_without_texture_stay_as_they_are(monkeypatch):
+    flat = np.full(SHAPE, 90, np.float32)
+    assert found_blur(monkeypatch, flat, flat) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("preset", ["default", "accurate"])
+def test_a_blurred_image_is_matched(preset):
+    left, right, u = views(blur_right=2.0)
+    found = match(left, right, HfvmParams(preset=preset))
+    both = seen(u, np.zeros(SHAPE), SHAPE, 16)
+    error = np.hypot(found.column_disparity - u, found.row_disparity)
+    usable = both & matched(found.validity)
+    assert usable.sum() > 0.9 * both.sum()
+    assert np.median(error[usable]) < 0.2
+    within = error[usable] < found.disparity_std[usable]
+    assert 0.5 < within.mean() < 0.95
