@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -28,6 +29,7 @@ from scipy.optimize import brentq
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
+from rille.stages.geometry.projection import product
 from rille.stages.geometry.scale import other_size
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
@@ -344,26 +346,45 @@ def turn(coarse: Coarse) -> Coarse:
 def focus(coarse: Coarse) -> Coarse:
     """The same with the ``blur`` that leaves the sharper image the detail of the other one; none where both are alike.
 
-    Detail is the energy of fine texture over that of coarser one, at the matches.
+    Detail is the energy of fine texture over that of coarser one, at the matches. It is not compared between images of
+    other scale, nor in an aligned image, which interpolation has blurred.
     """
-    state, images, side = coarse.state, coarse.images, 2**coarse.state.level
-    # 4000: places that tell the energies to a few per cent.
-    y, x = thinned(state.left_ok & textured(images.left.layers[state.level], images.params), 4000)
-    ends = y + state.left.v[y, x], x + state.left.u[y, x]
-    shown = [(k.layers[state.level].grey, at) for k, at in ((images.left, (y, x)), (images.right, ends))]
-
-    def detail(blur: float, grey: AnyArray, at: tuple[AnyArray, AnyArray]) -> float:
-        fine, middle, rough = (cv2.GaussianBlur(grey, None, math.hypot(s, blur / side))[at] for s in (0.7, 1.4, 2.8))
-        return float(np.sum(np.square(fine - middle)) / max(np.sum(np.square(middle - rough)), 1e-9))
-
-    left, right = (detail(0.0, *one) for one in shown)
-    sharper, less = shown[0] if left > right else shown[1], min(left, right)
-    # Pixels: cameras of one kind differ by up to 0.55, an aligned image from what it was by up to 0.65; beyond 4 there is
-    # little left to match.
-    if detail(0.8, *sharper) <= less or detail(4.0, *sharper) >= less:
+    state, h, level = coarse.state, coarse.alignment, coarse.state.level
+    layer, right, shape = coarse.images.left.layers[level], coarse.right.layers[level], coarse.images.left.shapes[0]
+    if h is not None and abs(math.log(plane.scale(h, shape))) > 0.15:
         return coarse
-    blur = brentq(lambda tried: detail(tried, *sharper) - less, 0.8, 4.0, xtol=0.01)
-    return replace(coarse, blur=(blur, 0.0) if left > right else (0.0, blur))
+    # 4000: places that tell the energies to a few per cent.
+    y, x = thinned(state.left_ok & textured(layer, coarse.images.params), 4000)
+    own = np.eye(3) if h is None else plane.to_original(h, shape)
+    own = np.linalg.inv(plane.finer(level)) @ own @ plane.finer(level)
+    p, q, w = product(own, x + state.left.u[y, x], y + state.left.v[y, x])
+    ends = [np.clip(np.rint(a / w).astype(np.int64), 0, n - 1) for a, n in zip((q, p), right.shape, strict=True)]
+    shown: list[tuple[AnyArray, Any]] = [(layer.grey, (y, x)), (right.grey, tuple(ends))]
+
+    def bands(blur: float, side: int, widths: Sequence[float]) -> list[AnyArray]:
+        grey, at = shown[side]
+        seen = [cv2.GaussianBlur(grey, None, math.hypot(k, blur / 2**level))[at] for k in widths]
+        return [fine - coarser for fine, coarser in pairwise(seen)]
+
+    def detail(fine: AnyArray, coarser: AnyArray) -> float:
+        return float(np.sum(np.square(fine[alike]))) / max(float(np.sum(np.square(coarser[alike]))), 1e-9)
+
+    a, b = (bands(0.0, side, (0.7, 1.4, 2.8, 4.0)) for side in (0, 1))
+    # Wrong matches show other detail, as a rule less than the place that they were sought for; right ones show the same
+    # coarse texture, which a blur leaves.
+    alike = np.abs(a[2] - b[2]) < 0.3 * np.minimum(np.abs(a[2]), np.abs(b[2]))
+    found = detail(*a[:2]), detail(*b[:2])
+    side, less = int(found[1] > found[0]), min(found)
+
+    def more(blur: float) -> float:
+        return detail(*bands(blur, side, (0.7, 1.4, 2.8))) - less
+
+    # 0.85: cameras of one kind have 0.93 and more, images blurred by 0.8 pixels have as much. Beyond 4 pixels there is
+    # little left to match.
+    if less >= 0.85 * max(found) or more(4.0) >= 0:
+        return coarse
+    blur = brentq(more, 0.0, 4.0, xtol=0.01)
+    return replace(coarse, blur=(0.0, blur) if side else (blur, 0.0))
 
 
 def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:

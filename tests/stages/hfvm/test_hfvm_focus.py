@@ -76,3 +76,12 @@ def test_a_blurred_image_is_matched(preset):
     assert np.median(error[usable]) < 0.2
     within = error[usable] < found.disparity_std[usable]
     assert 0.5 < within.mean() < 0.95
+
+
+@pytest.mark.data
+def test_wrong_matches_tell_no_blur(monkeypatch, data_dir):
+    left, right = (
+        cv2.imread(str(data_dir / "middlebury0506" / "Baby1" / f"view{k}.png"), cv2.IMREAD_GRAYSCALE) for k in (1, 5)
+    )
+    # A row offset of 64 pixels makes more of them: then the left image seemed to be sharper by 1.8 pixels.
+    assert found_blur(monkeypatch, left, cv2.copyMakeBorder(right, 64, 64, 64, 64, cv2.BORDER_CONSTANT)) == (0.0, 0.0)
