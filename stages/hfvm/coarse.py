@@ -346,13 +346,16 @@ def turn(coarse: Coarse) -> Coarse:
 def focus(coarse: Coarse) -> Coarse:
     """The same with the ``blur`` that leaves the sharper image the detail of the other one; none where both are alike.
 
-    Detail is the energy of fine texture over that of coarser one, at the matches. It is not compared between images of
-    other scale, nor in an aligned image, which interpolation has blurred.
+    Detail is the energy of fine texture over that of coarser one, at the matches; not in an aligned image, which
+    interpolation has blurred. Between images of other scale it follows from the scale.
     """
     state, h, level = coarse.state, coarse.alignment, coarse.state.level
     layer, right, shape = coarse.images.left.layers[level], coarse.right.layers[level], coarse.images.left.shapes[0]
-    if h is not None and abs(math.log(plane.scale(h, shape))) > 0.15:
-        return coarse
+    larger = 1.0 if h is None else plane.scale(h, shape)
+    if abs(math.log(larger)) > 0.15:
+        # A pixel sees its square, whose variance is 1/12.
+        blur = math.sqrt((max(larger, 1.0 / larger) ** 2 - 1.0) / 12.0)
+        return replace(coarse, blur=(0.0, blur) if larger > 1.0 else (blur, 0.0))
     # 4000: places that tell the energies to a few per cent.
     y, x = thinned(state.left_ok & textured(layer, coarse.images.params), 4000)
     own = np.eye(3) if h is None else plane.to_original(h, shape)

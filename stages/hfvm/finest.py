@@ -11,7 +11,6 @@ result of the pair matched in one window: tiles do not see patches and propagati
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -253,10 +252,10 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     removed = work.images.left.noise**2, work.images.right.noise**2
     deviations = work.a.deviation, nearest(work.b.deviation, Map(u, v))
     alike, variance = refinement.surroundings(rest, deviations, keep, removed)
-    # Denoising takes means of nine pixels, blurring of 4 pi b^2; the residuals have as many times less variance, and no
-    # match is placed better.
-    pixels = (9.0 if any(removed) else 1.0) * (1.0 + 4.0 * math.pi * max(work.blur) ** 2)
-    noise = per_noise * (variance * np.float32(pixels))
+    # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better. A
+    # blur takes the noise of one image of two.
+    hidden = (9.0 if any(removed) else 1.0) * (2.0 if any(work.blur) else 1.0)
+    noise = per_noise * (variance * np.float32(hidden))
     validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)
     return replace(fine, u=u, v=v, noise=noise, validity=validity)
 
