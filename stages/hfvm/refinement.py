@@ -109,24 +109,13 @@ def refine(
         step_u, step_v, rest, per_noise = planes
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
-    _take_back(start, rests[0], now, rests[-1])
+    # Start displacements and residuals where steps led far or away from a fit. Residuals are those before a step: after
+    # a single one the last is the first, and the distance alone counts.
+    du, dv = now[0] - start[0], now[1] - start[1]
+    worse = ~((rests[-1] <= rests[0]) & (du * du + dv * dv <= np.float32(MAX_CORRECTION_PX**2)))
+    for values, before in zip((*now, rests[-1]), (*start, rests[0]), strict=True):
+        np.copyto(values, before, where=worse)
     return Refined(*now, rests[-1], per_noise)
-
-
-@njit(cache=True, nogil=True)
-def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
-    """Start displacements and residuals where steps led far or away from a fit.
-
-    Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
-    """
-    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX**2)
-    for y in range(u.shape[0]):
-        for x in range(u.shape[1]):
-            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
-            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest)
-            new_u[y, x] = new_u[y, x] if better else u[y, x]
-            new_v[y, x] = new_v[y, x] if better else v[y, x]
-            last[y, x] = last[y, x] if better else first[y, x]
 
 
 @njit(cache=True, nogil=True)
@@ -344,10 +333,8 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
     for soft in (True, True, False, False):
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
         grey = _grey(images, u, v, keep)
-        stiff, normal = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
-        _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), stiff)
-        _normal(grey, u, v, holds, keep, stiff, normal)
-        u, v = _relax(normal, stiff, u, v)
+        stiff = _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness))
+        u, v = _relax(_normal(grey, u, v, holds, keep, stiff), stiff, u, v)
     if trust > 0:
         start_u, start_v = _feet(lines, trust, start_u, start_v, keep)
     good = keep & (np.hypot(u - start_u, v - start_v) <= MAX_CORRECTION_PX)
@@ -398,52 +385,39 @@ def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArra
     return u - e * lines[..., 0], v - e * lines[..., 1]
 
 
-@njit(cache=True, nogil=True)
-def _stiffness(u, v, keep, bend, stiffness, out):  # type: ignore[no-untyped-def]
-    """Weight of the second difference at each pixel along its row and column, 0 where a neighbour is unknown."""
-    rows, cols = u.shape
-    across, down = out
-    for y in range(rows):
-        for x in range(cols):
-            if not keep[y, x]:
-                continue
-            if x > 0 and x < cols - 1 and keep[y, x - 1] and keep[y, x + 1]:
-                d = u[y, x - 1] - u[y, x] + u[y, x + 1] - u[y, x]
-                e = v[y, x - 1] - v[y, x] + v[y, x + 1] - v[y, x]
-                across[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
-            if y > 0 and y < rows - 1 and keep[y - 1, x] and keep[y + 1, x]:
-                d = u[y - 1, x] - u[y, x] + u[y + 1, x] - u[y, x]
-                e = v[y - 1, x] - v[y, x] + v[y + 1, x] - v[y, x]
-                down[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+def _stiffness(u: AnyArray, v: AnyArray, keep: AnyArray, bend: np.float32, stiffness: np.float32) -> AnyArray:
+    """Weights (2, row, col) of the second difference at each pixel along its row and column, 0 where a neighbour is
+    unknown."""
+    planes = np.zeros((2, *u.shape), np.float32)
+    before, here, after = slice(None, -2), slice(1, -1), slice(2, None)
+    for out, a, b, there in ((planes[0], u, v, keep), (planes[1].T, u.T, v.T, keep.T)):
+        d, e = (m[:, before] - m[:, here] + m[:, after] - m[:, here] for m in (a, b))
+        weight = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+        np.copyto(out[:, here], weight, where=there[:, before] & there[:, here] & there[:, after])
+    return planes
 
 
-@njit(cache=True, nogil=True)
-def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def]
+def _normal(grey: AnyArray, u: AnyArray, v: AnyArray, holds: AnyArray, keep: AnyArray, stiff: AnyArray) -> AnyArray:
     """What the sweeps need of each pixel's normal equations (m n; n o) (u, v) = (p, q) + what its neighbours want.
 
-    ``out`` (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
+    Planes (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
     :func:`_grey`; ``holds``: lines whose distance is in grey levels.
     """
-    rows, cols = u.shape
-    four = np.float32(4.0)
-    for y in range(rows):
-        for x in range(cols):
-            if not keep[y, x]:
-                continue
-            w, gx, gy, rest = grey[0, y, x], grey[1, y, x], grey[2, y, x], grey[3, y, x]
-            lx, ly, off = holds[y, x, 0], holds[y, x, 1], holds[y, x, 2]
-            a, b, c = w * gx * gx + lx * lx, w * gx * gy + lx * ly, w * gy * gy + ly * ly
-            # Of the squared distance from the line only its offset is left: the displacement itself cancels.
-            warp = gx * u[y, x] + gy * v[y, x] + rest
-            p, q = w * gx * warp - lx * off, w * gy * warp - ly * off
-            s = four * (stiff[0, y, x] + stiff[1, y, x])
-            s += (stiff[0, y, x - 1] if x > 0 else 0) + (stiff[0, y, x + 1] if x < cols - 1 else 0)
-            s += (stiff[1, y - 1, x] if y > 0 else 0) + (stiff[1, y + 1, x] if y < rows - 1 else 0)
-            m, o = a + s, c + s
-            det = m * o - b * b
-            # Else hardly any texture, line or neighbour holds the pixel, and it stays.
-            if det > np.float32(1.0):
-                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
+    (w, gx, gy, rest), (lx, ly, off) = grey, np.moveaxis(holds, 2, 0)
+    n = w * gx * gy + lx * ly
+    # Of the squared distance from the line only its offset is left: the displacement itself cancels.
+    warp = gx * u + gy * v + rest
+    p, q = w * gx * warp - lx * off, w * gy * warp - ly * off
+    across, down = np.pad(stiff.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
+    neighbours = np.float32(4.0) * (stiff[0] + stiff[1])
+    neighbours = neighbours + (across[1:-1, :-2] + across[1:-1, 2:])
+    neighbours += down[:-2, 1:-1] + down[2:, 1:-1]
+    m, o = (w * g * g + along * along + neighbours for g, along in ((gx, lx), (gy, ly)))
+    det = m * o - n * n
+    # Else hardly any texture, line or neighbour holds the pixel, and it stays.
+    use = keep & (det > 1.0)
+    det = np.where(use, det, 1.0)
+    return np.where(use, np.stack([o / det, n / det, m / det, p, q]), 0.0).astype(np.float32)
 
 
 def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> Maps:
