@@ -334,7 +334,9 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
         grey = _grey(images, u, v, keep)
         stiff = _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness))
-        u, v = _relax(_normal(grey, u, v, holds, keep, stiff), stiff, u, v)
+        normal = np.zeros((5, *u.shape), np.float32)
+        _normal(grey, u, v, holds, keep, stiff, normal)
+        u, v = _relax(normal, stiff, u, v)
     if trust > 0:
         start_u, start_v = _feet(lines, trust, start_u, start_v, keep)
     good = keep & (np.hypot(u - start_u, v - start_v) <= MAX_CORRECTION_PX)
@@ -397,27 +399,33 @@ def _stiffness(u: AnyArray, v: AnyArray, keep: AnyArray, bend: np.float32, stiff
     return planes
 
 
-def _normal(grey: AnyArray, u: AnyArray, v: AnyArray, holds: AnyArray, keep: AnyArray, stiff: AnyArray) -> AnyArray:
+@njit(cache=True, nogil=True)
+def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def]
     """What the sweeps need of each pixel's normal equations (m n; n o) (u, v) = (p, q) + what its neighbours want.
 
-    Planes (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
+    ``out`` (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
     :func:`_grey`; ``holds``: lines whose distance is in grey levels.
     """
-    (w, gx, gy, rest), (lx, ly, off) = grey, np.moveaxis(holds, 2, 0)
-    n = w * gx * gy + lx * ly
-    # Of the squared distance from the line only its offset is left: the displacement itself cancels.
-    warp = gx * u + gy * v + rest
-    p, q = w * gx * warp - lx * off, w * gy * warp - ly * off
-    across, down = np.pad(stiff.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
-    neighbours = np.float32(4.0) * (stiff[0] + stiff[1])
-    neighbours = neighbours + (across[1:-1, :-2] + across[1:-1, 2:])
-    neighbours += down[:-2, 1:-1] + down[2:, 1:-1]
-    m, o = (w * g * g + along * along + neighbours for g, along in ((gx, lx), (gy, ly)))
-    det = m * o - n * n
-    # Else hardly any texture, line or neighbour holds the pixel, and it stays.
-    use = keep & (det > 1.0)
-    det = np.where(use, det, 1.0)
-    return np.where(use, np.stack([o / det, n / det, m / det, p, q]), 0.0).astype(np.float32)
+    rows, cols = u.shape
+    four = np.float32(4.0)
+    for y in range(rows):
+        for x in range(cols):
+            if not keep[y, x]:
+                continue
+            w, gx, gy, rest = grey[0, y, x], grey[1, y, x], grey[2, y, x], grey[3, y, x]
+            lx, ly, off = holds[y, x, 0], holds[y, x, 1], holds[y, x, 2]
+            a, b, c = w * gx * gx + lx * lx, w * gx * gy + lx * ly, w * gy * gy + ly * ly
+            # Of the squared distance from the line only its offset is left: the displacement itself cancels.
+            warp = gx * u[y, x] + gy * v[y, x] + rest
+            p, q = w * gx * warp - lx * off, w * gy * warp - ly * off
+            s = four * (stiff[0, y, x] + stiff[1, y, x])
+            s += (stiff[0, y, x - 1] if x > 0 else 0) + (stiff[0, y, x + 1] if x < cols - 1 else 0)
+            s += (stiff[1, y - 1, x] if y > 0 else 0) + (stiff[1, y + 1, x] if y < rows - 1 else 0)
+            m, o = a + s, c + s
+            det = m * o - b * b
+            # Else hardly any texture, line or neighbour holds the pixel, and it stays.
+            if det > np.float32(1.0):
+                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
 
 
 def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> Maps:

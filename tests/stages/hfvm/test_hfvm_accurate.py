@@ -298,7 +298,8 @@ def test_sweeps_converge_to_the_minimum():
     there = np.tile(keep.ravel(), 2)
     want = np.zeros(2 * n)
     want[there] = np.linalg.solve(matrix[np.ix_(there, there)], right[there])
-    normal = refinement._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff)
+    normal = np.zeros((5, *shape), float32)
+    refinement._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff, normal)
     assert np.count_nonzero(normal[0]) == keep.sum()
     for _ in range(60):
         u, v = refinement._relax(normal, stiff, u, v)
