@@ -39,7 +39,7 @@ from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 FORMS = (
@@ -250,11 +250,13 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
         cameras = Cameras.model_validate({**stated, "names": beside.names})
         manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
         line = warning("RIL-825", f"{path} has no {missing}: its cameras are those of {' and '.join(beside.files)}")
-        optics = read_optics(manifest, path.parent, str(path), sizes)
+        with within(str(path)):
+            optics = read_optics(manifest, path.parent, sizes)
         return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
     (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
     rig, lenses = rig_of(left, right, sizes)
-    check_baseline(rig.baseline, RigSection(), str(path))
+    with within(str(path)):
+        check_baseline(rig.baseline, RigSection())
     return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
 
 

@@ -32,6 +32,9 @@ from rille.stages.geometry.geometry import RigidTransform
 TRUTH: Mapping[str, bool] = {"state_groundtruth_estimate0": True, "gt": True, "mocap0": True, "vicon0": False}
 """Folders of true poses, the best first, and whether they are those of the body where no ``T_BS`` is stated."""
 
+IMU = "imu0"
+"""Folder of the IMU."""
+
 FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data; imu0, state_groundtruth_estimate0"),)
 
 
@@ -75,30 +78,22 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
     if left.T_camera_reference is None:
         text = f"{folder / 'cam0'} does not say where the camera stands in the body (T_BS): truth and IMU are not used"
         return None, None, [warning("RIL-682", text)]
-    T_body_left = left.T_camera_reference.inverse()
-    truth, imu, warnings = None, None, []
-    name = next((name for name in TRUTH if (folder / name / "data.csv").is_file()), None)
-    if name is not None:
-        T_body_marker = body_pose(folder / name)
-        if T_body_marker is None and not TRUTH[name]:
-            text = f"{folder / name} does not say how its markers stand in the body (T_BS): it is not used as truth"
-            warnings.append(warning("RIL-685", text))
-        else:
-            T_marker_left = T_body_left if T_body_marker is None else T_body_marker.inverse() @ T_body_left
-            # s; truth is interpolated over no longer gap: at 5 m/s^2 the straight line is then 1.4 cm off at most
-            truth = Truth(
-                file=f"{name}/data.csv",
-                T_body_left=tuple(T_marker_left.to_list()),
-                max_gap=0.15,
-                source=f"{name}, interpolated to the images' times",
-            )
-    if (folder / "imu0" / "data.csv").is_file():
-        T_body_imu = body_pose(folder / "imu0")
-        if T_body_imu is None:
-            text = f"{folder / 'imu0'} does not say how the IMU stands in the body (T_BS): it is not used"
+    T_body_left, truth, imu, warnings = left.T_camera_reference.inverse(), None, None, []
+    recorded = [name for name in (*TRUTH, IMU) if (folder / name / "data.csv").is_file()]
+    best = next((name for name in recorded if name in TRUTH), None)
+    for name in (name for name in recorded if name in (best, IMU)):
+        T_body_sensor = body_pose(folder / name) or (RigidTransform.identity() if TRUTH.get(name) else None)
+        if T_body_sensor is None:
+            text = f"{folder / name} does not say how it stands in the body (T_BS): it is not used"
             warnings.append(warning("RIL-683", text))
+            continue
+        file, pose = f"{name}/data.csv", tuple((T_body_sensor.inverse() @ T_body_left).to_list())
+        if name == IMU:
+            imu = Imu(file=file, T_imu_left=pose)
         else:
-            imu = Imu(file="imu0/data.csv", T_imu_left=tuple((T_body_imu.inverse() @ T_body_left).to_list()))
+            # s; truth is interpolated over no longer gap: at 5 m/s^2 the straight line is then 1.4 cm off at most
+            source = f"{name}, interpolated to the images' times"
+            truth = Truth(file=file, T_body_left=pose, max_gap=0.15, source=source)
     return truth, imu, warnings
 
 

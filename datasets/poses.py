@@ -38,7 +38,7 @@ from rille.datasets.text.units import unitless
 from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
 QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -369,10 +369,8 @@ def rounded_pose(m: Floats, where: str) -> RigidTransform:
     InputError
         It is not even roughly a rotation; the message begins with ``where``.
     """
-    try:
+    with within(where):
         RigidTransform(m[:, :3], m[:, 3])
-    except InputError as error:
-        raise error.at(where) from error
     return RigidTransform(orthonormal(m[:, :3]), m[:, 3])
 
 

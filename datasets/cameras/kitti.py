@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.cameras.text import entries
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
 
@@ -64,10 +64,8 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
 
 def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     projection = fields.matrix(label, 3, 4)
-    try:
+    with within(fields.file):
         k, T_camera_reference = decompose(projection, label)
-    except InputError as error:
-        raise error.at(fields.file) from error
     number = label.rpartition("_")[2] if label.startswith("P_rect") else ""
     camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.pair_of_pixels(f"S_rect_{number}"))
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)

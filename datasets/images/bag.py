@@ -51,11 +51,6 @@ class Message(NamedTuple):
     topic: str
     at: int
 
-    @staticmethod
-    def from_dict(d: Mapping[str, Any]) -> Message:
-        """Inverse of ``_asdict()``."""
-        return Message(**d)
-
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:

@@ -22,7 +22,7 @@ from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 
 Sign = Literal["left-right", "right-left"]
 
@@ -100,10 +100,8 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
     InputError
         Maps and images do not fit, or the pattern is none.
     """
-    try:
+    with within(key):
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
-    except InputError as error:
-        raise error.at(key) from error
     lacking = list[str]()
     for name in (lambda path: without_side(path.stem, 0), _number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))

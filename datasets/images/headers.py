@@ -6,7 +6,6 @@ decoder ever sees a file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, BinaryIO, NamedTuple
 from warnings import catch_warnings
@@ -20,11 +19,6 @@ class Header(NamedTuple):
     width: int
     height: int
     depth: int
-
-    @staticmethod
-    def from_dict(d: Mapping[str, int]) -> Header:
-        """Inverse of ``_asdict()``."""
-        return Header(**d)
 
 
 Headers = tuple[Header, Header]

@@ -54,14 +54,12 @@ class MotionReader:
     Attributes
     ----------
     root : folder that files are relative to.
-    name : the manifest's, for errors.
     pairs : of images; of some a file may be absent.
     sequence : with what has been read so far; times come first, by which the others are interpolated.
     growing : images are still arriving, so that a table may have rows for more of them.
     """
 
     root: Path
-    name: str
     pairs: Sequence[ImagePair]
     sequence: protocol.Sequence
     growing: bool = False
@@ -129,7 +127,7 @@ class MotionReader:
         wrong = stamps.index("") if "" in stamps else 0
         small = unit == "auto" and len(stamps) > 2 and "" not in stamps and float(stamps[0]) < 1e8
         if "" in stamps or (small and set(np.diff(np.array(stamps, float))) == {1}):
-            text = f"{self.name}: times.names: {self.pairs[wrong].left} has no number in its name, or one that counts"
+            text = f"times.names: {self.pairs[wrong].left} has no number in its name, or one that counts"
             remedy = 'give times.file or times.rate_hz; or, where the names are seconds, times.unit = "s"'
             raise InputError("RIL-227", text, remedy=remedy)
         return unit, [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
@@ -194,7 +192,7 @@ class MotionReader:
         poses: Poses = timed.poses
         if timed.times is not None:
             if self.sequence.times is None:
-                text = f"{self.name}: the poses of {path} have times, but the pairs have none"
+                text = f"the poses of {path} have times, but the pairs have none"
                 raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
             moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
@@ -210,7 +208,7 @@ class MotionReader:
         elif (one_a_pair := self.one_a_pair(poses)) is not None:
             poses = tuple(one_a_pair)
         else:
-            text = f"{self.name}: {table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
+            text = f"{table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
         if section.T_body_left is None:
             return poses
@@ -233,7 +231,7 @@ class MotionReader:
         if not any(poses):
             text = f"{timed.name} has poses of {ends([Path(image) for image in timed.images])}, none of a left image"
             left = ends([pair.left for pair in self.pairs])
-            raise InputError("RIL-975", f"{self.name}: {text} ({left})", remedy="give the model of these images")
+            raise InputError("RIL-975", f"{text} ({left})", remedy="give the model of these images")
         return poses
 
     def truth(self, section: Truth) -> None:
@@ -246,7 +244,7 @@ class MotionReader:
             self.state(truth_positions=self.true_positions(section, alone))
             return
         if section.lever_arm is not None:
-            text = f"{self.name}: truth.lever_arm: {section.file} holds poses, not positions alone"
+            text = f"truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
         mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
         self.state(truth=self.poses(section, "truth", rows), truth_mount=mount)
@@ -262,12 +260,10 @@ class MotionReader:
     def true_positions(self, section: Truth, found: TimedPositions) -> protocol.Positions:
         """Positions of the truth, which have no rotations."""
         if section.T_body_left is not None:
-            text = f"{self.name}: truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
+            text = f"truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
             raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
         if (section.sigma_m or section.sigma_deg) is not None:
-            text = (
-                f"{self.name}: truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
-            )
+            text = f"truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
         self.refuse_sparse(section, times or (), "truth")
@@ -277,7 +273,7 @@ class MotionReader:
         """Refuse rows of which most are more than ``max_gap``, s, apart, so that there is nothing between them."""
         spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         if spacing > section.max_gap:
-            text = f"{self.name}: {table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
+            text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"
             remedy = f"raise {table}.max_gap, if straight lines between them are exact enough"
             raise InputError("RIL-804", text, remedy=remedy)
@@ -299,7 +295,7 @@ class MotionReader:
             return found.positions, times
         rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         if len(rows) != len(self.pairs):
-            text = f"{self.name}: {table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
+            text = f"{table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
             remedy = "give one a pair, or times of both ([times] of the pairs)"
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
@@ -314,7 +310,7 @@ class MotionReader:
         """
         found = positions_of(read_motion(self.root / section.file), "auto", section.columns, section.unit)
         if found is None:
-            text = f"{self.name}: positions.file: {section.file} holds poses, or columns without names"
+            text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
         rows, times = self.positions(section, found, "positions")
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
@@ -337,7 +333,7 @@ class MotionReader:
         """Rotations and vertical by an IMU."""
         sequence = self.sequence
         if sequence.times is None:
-            text = f"{self.name}: [imu] needs times, but the pairs have none"
+            text = "[imu] needs times, but the pairs have none"
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)

@@ -27,7 +27,7 @@ from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import Search, read_bytes
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import IncompleteError, InputError
+from rille.stages.core.errors import IncompleteError, InputError, within
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -53,16 +53,21 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
     root : folder that the files are relative to.
     name : the manifest's or the folder's, for errors.
     """
-    base, pairs = _of_bag(manifest, root, name) or _of_files(manifest, root, name, digests)
+    with within(name):
+        return _described(manifest, root, digests)
+
+
+def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequence:
+    base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
     if manifest.disparity is not None:
         note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity = _disparity("disparity", manifest.disparity, root, name, (base, pairs), digests)
+        disparity = _disparity("disparity", manifest.disparity, root, (base, pairs), digests)
         base = replace(base, disparity=disparity, notes=(*base.notes, note))
     if manifest.truth_disparity is not None:
-        exact = _disparity("truth_disparity", manifest.truth_disparity, root, name, (base, pairs), digests)
+        exact = _disparity("truth_disparity", manifest.truth_disparity, root, (base, pairs), digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
         base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
-    sequence = MotionReader(root, name, pairs, base, growing=digests.growing).read(manifest)
+    sequence = MotionReader(root, pairs, base, growing=digests.growing).read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     return replace(
         sequence,
@@ -82,14 +87,12 @@ def _are_rectified(images: Images, names: Iterable[str]) -> bool:
     return all(map(RECTIFIED.search, names)) if images.rectified is None else images.rectified
 
 
-def _of_files(
-    manifest: Manifest, root: Path, name: str, digests: files.Digests
-) -> tuple[Sequence, tuple[ImagePair, ...]]:
+def _of_files(manifest: Manifest, root: Path, digests: files.Digests) -> tuple[Sequence, tuple[ImagePair, ...]]:
     """Images and cameras of a manifest that names files."""
     lines: list[str] = []
-    headers, pairs = common_headers(find_pairs(manifest.images, root, name, lines, digests))
+    headers, pairs = common_headers(find_pairs(manifest.images, root, lines, digests))
     names = (os.path.relpath(path, root.parent) for path in (pairs[0].left, pairs[0].right))
-    optics = read_optics(manifest, root, name, sizes_of(headers), _are_rectified(manifest.images, names))
+    optics = read_optics(manifest, root, sizes_of(headers), _are_rectified(manifest.images, names))
 
     def image(frame: int, camera: str) -> Source:
         pair = pairs[frame]
@@ -110,7 +113,7 @@ def _of_files(
     return sequence, pairs
 
 
-def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[ImagePair, ...]] | None:
+def _of_bag(manifest: Manifest, root: Path) -> tuple[Sequence, tuple[ImagePair, ...]] | None:
     """The same of one that names a bag, whose ``camera_info`` counts where the manifest states no cameras."""
     (path, _, left), (other, _, right) = (text.partition(":") for text in (manifest.images.left, manifest.images.right))
     if path != other or not is_bag(root / path):
@@ -118,7 +121,7 @@ def _of_bag(manifest: Manifest, root: Path, name: str) -> tuple[Sequence, tuple[
     stated = manifest.cameras != Cameras() or manifest.rig != RigSection()
     topics = f"{left},{right}" if left and right else None
     rectified = _are_rectified(manifest.images, (left, right))
-    optics_of = (lambda sizes: read_optics(manifest, root, name, sizes, rectified)) if stated else None
+    optics_of = (lambda sizes: read_optics(manifest, root, sizes, rectified)) if stated else None
     sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance)
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
@@ -127,27 +130,26 @@ def _disparity(
     key: str,
     stated: DisparityMaps,
     root: Path,
-    name: str,
     found: tuple[Sequence, tuple[ImagePair, ...]],
     digests: files.Digests,
 ) -> Callable[[int], Source]:
     """Source of the disparity of a frame that another program made, or of the true one; ``key``: the table's name."""
     sequence, pairs = found
     if sequence.lenses:
-        text = f"{name}: [{key}] needs images without distortion: maps are of undistorted, rectified images"
+        text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
     frames = [k for k, pair in enumerate(pairs) if not pair.absent]
     lefts = [pairs[k].left for k in frames]
-    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{name}: {key}.left")}
+    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{key}.left")}
     claimed = stated.sigma if isinstance(stated, Disparity) else None
     sigma = claimed if isinstance(claimed, float) else None
     if isinstance(claimed, str):
-        maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{name}: {key}.sigma")
+        maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
     for first, *_ in maps.values():
-        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, f"{name}: {first}")  # says what is wrong
+        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # says what is wrong
 
     def source(frame: int) -> Source:
         paths = {array: of[frames.index(frame)] for array, of in maps.items()}
@@ -186,9 +188,7 @@ def root_folder(text: str, path: Path) -> Path:
     return root
 
 
-def find_pairs(
-    images: Images, root: Path, name: str, lines: list[str], digests: files.Digests
-) -> tuple[ImagePair, ...]:
+def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Digests) -> tuple[ImagePair, ...]:
     """The pairs that the patterns find; where files are paired by name, some may lack one (``ImagePair.absent``).
 
     Parameters
@@ -204,35 +204,30 @@ def find_pairs(
     for side, stated in (("left", images.left), ("right", images.right)):
         # A folder stands for what it holds.
         pattern = f"{stated.rstrip('/')}/*" if stated and os.path.isdir(root / stated) else stated
-        try:
+        with within(f"images.{side}"):
             paths = search.matching(root, pattern)
-        except InputError as error:
-            raise error.at(f"{name}: images.{side}") from error
         if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
             paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
         paths = [path for path in paths if digests.whole(path)]
         for path in paths:
             writable(path.name)
         if not paths:
-            text = "; ".join([f"{name}: images.{side} = {pattern!r} finds no file in {root}", *search.closed[:1]])
+            text = "; ".join([f"images.{side} = {pattern!r} finds no file in {root}", *search.closed[:1]])
             raise IncompleteError("RIL-217", text, remedy="correct the pattern, root or rights")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))
     if both:
-        text = f"{name}: images.left and images.right both find {both[0]}"
+        text = f"images.left and images.right both find {both[0]}"
         raise InputError("RIL-218", text, remedy="narrow the patterns")
-    try:
-        return pair_up(
-            found["left"],
-            found["right"],
-            images.pair,
-            gaps=True,
-            growing=digests.growing,
-            tolerance=images.tolerance,
-            warnings=lines,
-        )
-    except InputError as error:
-        raise error.at(name) from error
+    return pair_up(
+        found["left"],
+        found["right"],
+        images.pair,
+        gaps=True,
+        growing=digests.growing,
+        tolerance=images.tolerance,
+        warnings=lines,
+    )
 
 
 def dotted(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -14,7 +14,7 @@ from rille.datasets.cameras.pair import MAX_OFF_CENTRE
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
@@ -44,13 +44,12 @@ class Optics:
     warnings: tuple[str, ...]
 
 
-def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectified: bool = False) -> Optics:
+def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = False) -> Optics:
     """Rig and lenses of a manifest.
 
     Parameters
     ----------
     root : folder that calibration files are relative to.
-    name : what to call the manifest in an error.
     sizes : of the images.
     rectified : whether the images are; then their cameras are those that the calibration has for such images.
 
@@ -59,67 +58,64 @@ def read_optics(manifest: Manifest, root: Path, name: str, sizes: Sizes, rectifi
     InputError
         The cameras or their relative pose are not stated, contradict the images, or cannot be.
     """
-    raw = _cameras(manifest.cameras, root, name, sizes)
-    left, right = (_rectified(camera, name) if rectified else camera for camera in raw)
+    raw = _cameras(manifest.cameras, root, sizes)
+    left, right = (_rectified(camera) if rectified else camera for camera in raw)
     # Before anything compares lengths: the manifest's own are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
     above = manifest.world.up
     up = None if above is None else direction(above, left.T_camera_reference)
     pinned = None if manifest.rig.file is None else _pinned(root / manifest.rig.file)
     stated = _stated(manifest.rig) if pinned is None else pinned.T_right_left
-    left, right, lines = _placed(left, right, stated, name)
-    try:
-        rig, lenses = rig_of(left, right, sizes)
-    except InputError as error:
-        raise error.at(name) from error
+    left, right, lines = _placed(left, right, stated)
+    rig, lenses = rig_of(left, right, sizes)
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
-        text = f"{name}: rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
+        text = f"rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
         raise InputError("RIL-021", text, remedy="estimate it from runs with this calibration")
-    check_baseline(rig.baseline, manifest.rig, name)
+    check_baseline(rig.baseline, manifest.rig)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
-        text = f"{name}: the images are rectified by their name: their camera is P, without the distortion"
+        text = "the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
     return Optics(rig, lenses, up, (*lines, *unusual_cameras((left, right), sizes)))
 
 
-def _cameras(section: Cameras, root: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
+def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
     if section.left is not None and section.right is not None:
         stated = ("left", section.left, sizes[0]), ("right", section.right, sizes[1])
-        return tuple(_one(value, side, root, name, size) for side, value, size in stated)
+        return tuple(_one(value, side, root, size) for side, value, size in stated)
     found: tuple[CalibratedCamera, ...] = ()
     if section.file is not None:
-        found = _of_file(section, root / section.file, name, sizes)
+        found = _of_file(section, root / section.file, sizes)
     elif section.stated:
-        found = tuple(_one(section, side, root, name, sizes[0]) for side in ("left", "right"))
+        found = tuple(_one(section, side, root, sizes[0]) for side in ("left", "right"))
     if found and found[0].lens == found[1].lens and sizes[0] != sizes[1]:
         left, right = (f"{width} x {height}" for width, height in sizes)
-        text = f"{name}: left images have {left} pixels, right ones {right}, and one camera is stated for both"
+        text = f"left images have {left} pixels, right ones {right}, and one camera is stated for both"
         raise InputError("RIL-960", text, remedy="give cameras.left and cameras.right")
     if found:
         return found
-    text = f"{name}: the cameras are not known"
+    text = "the cameras are not known"
     remedy = "give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)"
     raise InputError("RIL-235", text, remedy=remedy)
 
 
-def _rectified(camera: CalibratedCamera, name: str) -> CalibratedCamera:
+def _rectified(camera: CalibratedCamera) -> CalibratedCamera:
     """The camera of rectified images; the one that there is where it has no distortion."""
     if camera.rectified is None and not camera.lens.ideal:
         raise InputError(
             "RIL-816",
-            f"{name}: the images are taken as rectified, and the calibration of camera {camera.name} has a "
+            f"the images are taken as rectified, and the calibration of camera {camera.name} has a "
             "distortion, which would be taken off twice",
             remedy="give the calibration of the rectified images (P), or images.rectified = false if they are raw",
         )
     return camera.rectified or camera
 
 
-def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple[int, int]) -> CalibratedCamera:
+def _one(value: str | PinholeLens, side: str, root: Path, size: tuple[int, int]) -> CalibratedCamera:
     """The camera of one side: of a file with one camera, or of figures."""
     if isinstance(value, str):
         found = read_cameras(root / value)
         if len(found) != 1:
-            text = f"{name}: cameras.{side}: {root / value} has {len(found)} cameras"
+            text = f"cameras.{side}: {root / value} has {len(found)} cameras"
             raise InputError("RIL-236", text, remedy="give it as cameras.file, and name the two by cameras.names")
         return found[0]
     assert value.fx is not None
@@ -129,25 +125,23 @@ def _one(value: str | PinholeLens, side: str, root: Path, name: str, size: tuple
     width, height = (value.width or size[0], value.height or size[1]) if stated else UNKNOWN_SIZE
     camera = Camera(value.fx, value.fy or value.fx, value.cx, value.cy, width, height)
     model = value.model or ("radtan" if value.distortion else "none")
-    try:
+    with within("cameras"):
         return CalibratedCamera(side, Lens(camera, model, value.distortion), None)
-    except InputError as error:
-        raise error.at(f"{name}: cameras") from error
 
 
-def _of_file(section: Cameras, path: Path, name: str, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
+def _of_file(section: Cameras, path: Path, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
     """Left and right camera of one file; a single camera is taken for both."""
     found = read_cameras(path)
     if section.names is not None:
         by_name = {camera.name: camera for camera in found}
         missing = [wanted for wanted in section.names if wanted not in by_name]
         if missing:
-            text = f"{name}: cameras.names: {path} has no camera {missing[0]!r}"
+            text = f"cameras.names: {path} has no camera {missing[0]!r}"
             raise InputError("RIL-237", text, remedy=f"it has {', '.join(by_name)}")
         return tuple(by_name[wanted] for wanted in section.names)
     found = of_size(found, sizes)
     if len(found) > 2:
-        text = f"{name}: {path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
+        text = f"{path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
         raise InputError("RIL-238", text, remedy="say which two by cameras.names = [left, right]")
     if len(found) == 1:
         # Its pose, if it has one, is that of one camera: where the other one stands the manifest has to say.
@@ -173,14 +167,14 @@ def direction(
 
 
 def _placed(
-    left: CalibratedCamera, right: CalibratedCamera, stated: RigidTransform | None, name: str
+    left: CalibratedCamera, right: CalibratedCamera, stated: RigidTransform | None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame: what the manifest says goes before what a file says."""
     of_files = None
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
     if stated is None and of_files is None:
-        text = f"{name}: the rig is not known: nothing says where the right camera stands"
+        text = "the rig is not known: nothing says where the right camera stands"
         remedy = "give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it"
         raise InputError("RIL-241", text, remedy=remedy)
     chosen = stated if stated is not None else of_files
@@ -211,12 +205,12 @@ def _stated(section: RigSection) -> RigidTransform | None:
     return None if section.baseline is None else parallel(section.baseline)
 
 
-def check_baseline(baseline: float, section: RigSection, name: str) -> None:
+def check_baseline(baseline: float, section: RigSection) -> None:
     """Refuse a length (m) that looks like one in another unit, unless the unit is stated."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
-        text = f"{name}: the baseline is {baseline:g} m, which looks like millimetres or centimetres"
+        text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"
         remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
         raise InputError("RIL-244", text, remedy=remedy)
 

@@ -1,20 +1,21 @@
 """Judge the figures of a sequence against a table of limits: one finding a subject, with a code and a remedy.
 
-Plain numbers in, findings out; :mod:`rille.pipeline.commands.sequences.check` measures them. FAIL: a reconstruction is
-useless or impossible. WARN: it gets worse, or the input is probably a mistake.
+A sequence or plain numbers in, findings out; :mod:`rille.pipeline.commands.sequences.check` measures the numbers. FAIL:
+a reconstruction is useless or impossible. WARN: it gets worse, or the input is probably a mistake.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from rille.datasets.protocol import Positions, Rows
+from rille.datasets.protocol import Sequence
 from rille.datasets.text.count import count
 from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.core.arrays import Floats
@@ -29,6 +30,8 @@ from rille.stages.terrain.reference import camera_height
 
 Level = Literal["OK", "WARN", "FAIL"]
 Look = Mapping[str, Any]
+Frames = Series[int]
+Poses = Series[RigidTransform | None]
 
 MAX_SPEED = 60.0
 """m/s between most records of a sensor, which no vehicle with stereo cameras drives."""
@@ -204,11 +207,14 @@ def judge_rig(rig: Rig) -> Finding:
     return judge("rig", words, figures)
 
 
-def judge_times(times: Sequence[float] | None) -> Finding:
+# -- what is recorded of each frame: of a sequence, some of whose frames are chosen ---------------------------------
+
+
+def judge_times(of: Sequence, frames: Frames) -> Finding:
     """Order, rate and gaps of the frames' times, s."""
-    steps = np.diff(np.asarray(times or (), dtype=np.float64))
+    steps = np.diff([] if of.times is None else [of.times[k] for k in frames])
     if not steps.size:
-        return judge("times", "none: frames count as equally spaced" if times is None else "one frame")
+        return judge("times", "none: frames count as equally spaced" if of.times is None else "one frame")
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
         return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
@@ -220,105 +226,96 @@ def judge_times(times: Sequence[float] | None) -> Finding:
     return judge("times", words, {"gaps": gaps})
 
 
-def judge_truth(
-    truth: Sequence[RigidTransform | None] | None, frames: Sequence[int], positions: Positions | None = None
-) -> Finding:
+def judge_truth(of: Sequence, frames: Frames) -> Finding:
     """How many frames have truth, and how long the way is."""
-    if truth is None and positions is not None:
-        places, times = np.array(positions.positions), positions.times
-        length = float(lengths_along(places)[-1])
-        when = "one a frame" if times is None else f"{times[0]:.2f} to {times[-1]:.2f} s, a constant offset is found"
-        axes = "x, y, z" if places.shape[1] == 3 else "x, y"
-        rows = f"positions only ({axes}), {len(places)} rows, {length:.4g} m, {when}"
-        return judge("truth", f"{rows}; compared after a fit in the plane")
-    if truth is None:
+    if of.truth is not None:
+        known = [k for k in frames if of.truth[k] is not None]
+        words = f"{len(known)} of {len(frames)} frames, {_length(of.truth, known):.4g} m"
+        return judge("truth", words, {"without": len(frames) - len(known)})
+    if of.truth_positions is None:
         return judge("truth", "none: accuracy is only known against the cross-check")
-    known = [T for T in (truth[k] for k in frames) if T is not None]
-    words = f"{len(known)} of {len(frames)} frames, {_length(known):.4g} m"
-    return judge("truth", words, {"without": len(frames) - len(known)})
+    places, times = np.array(of.truth_positions.positions), of.truth_positions.times
+    when = "one a frame" if times is None else f"{times[0]:.2f} to {times[-1]:.2f} s, a constant offset is found"
+    axes = "x, y, z" if places.shape[1] == 3 else "x, y"
+    rows = f"positions only ({axes}), {len(places)} rows, {float(lengths_along(places)[-1]):.4g} m, {when}"
+    return judge("truth", f"{rows}; compared after a fit in the plane")
 
 
-def judge_odometry(
-    odometry: Sequence[RigidTransform | None] | None,
-    truth: Sequence[RigidTransform | None] | None,
-    times: Sequence[float] | None,
-    frames: Sequence[int],
-) -> Finding | None:
+def judge_odometry(of: Sequence, frames: Frames) -> Finding | None:
     """Coverage, length and speed of the dead reckoning, and whether truth is as long."""
-    if odometry is None:
+    if of.odometry is None:
         return None
-    known = [k for k in frames if odometry[k] is not None]
-    length, figures = _length(odometry[k] for k in known), {"without": float(len(frames) - len(known))}
+    known = [k for k in frames if of.odometry[k] is not None]
+    length, figures = _length(of.odometry, known), {"without": float(len(frames) - len(known))}
     words = f"{len(known)} of {len(frames)} frames, {length:.4g} m"
-    if times is not None and known and times[known[-1]] > times[known[0]]:
-        figures["m/s"] = length / (times[known[-1]] - times[known[0]])
+    if of.times is not None and known and of.times[known[-1]] > of.times[known[0]]:
+        figures["m/s"] = length / (of.times[known[-1]] - of.times[known[0]])
         words += f", {figures['m/s']:.3g} m/s"
-    both = [k for k in known if truth is not None and truth[k] is not None]
-    if truth is not None and (true := _length(truth[k] for k in both)) > 0:
-        share = figures["length over the truth's"] = _length(odometry[k] for k in both) / true
+    both = [k for k in known if of.truth is not None and of.truth[k] is not None]
+    if of.truth is not None and (true := _length(of.truth, both)) > 0:
+        share = figures["length over the truth's"] = _length(of.odometry, both) / true
         words += f", {share:.3g} of the truth's length"
     return judge("odometry", words, figures)
 
 
-def judge_positions(
-    measured: Mapping[str, Any] | None, times: Sequence[float] | None, frames: Sequence[int]
-) -> Finding | None:
+def judge_positions(of: Sequence, frames: Frames) -> Finding | None:
     """How many measured positions are of the images' time, and how far and how fast they lead."""
-    if measured is None:
+    if (measured := of.priors.get("positions")) is None:
         return None
     at, places = np.array(measured["times"]), np.array(measured["positions"])
-    first, last = (float(k if times is None else times[k]) for k in (frames[0], frames[-1]))
+    first, last = (float(k if of.times is None else of.times[k]) for k in (frames[0], frames[-1]))
     inside = (at >= first) & (at <= last)
     steps, sigma = np.linalg.norm(np.diff(places[inside], axis=0), axis=1), np.array(measured["sigma"])
     words = f"{len(at)} rows, {int(inside.sum())} of them while the images were taken, {steps.sum():.4g} m"
     figures = {"rows": int(inside.sum()), "lengths over sigma": float(steps.sum() / sigma[:2].max())}
-    if times is not None and len(steps):
+    if of.times is not None and len(steps):
         figures["m/s"] = float(np.median(steps / np.diff(at[inside])))
         words += f", {figures['m/s']:.3g} m/s"
     each = " x ".join(f"{v:g}" for v in dict.fromkeys(sigma.tolist()))
     return judge("positions", f"{words}; standard deviation {each} m", figures)
 
 
-def _length(poses: Iterable[RigidTransform | None]) -> float:
-    """Length, m, of the way between the poses that there are."""
-    known = [T.translation for T in poses if T is not None]
-    return sum(float(np.linalg.norm(b - a)) for a, b in pairwise(known))
-
-
-def judge_attitude(
-    attitude: Sequence[Rows | None] | None,
-    truth: Sequence[RigidTransform | None] | None,
-    frames: Sequence[int],
-    *,
-    imu: bool = False,
-) -> Finding | None:
+def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
     """Coverage of the attitude, which may be that of an IMU, and whether it turns as truth does."""
-    if attitude is None:
+    if of.attitude is None:
         return None
-    known = [k for k in frames if attitude[k] is not None]
-    true = {k: T.rotation for k in known if truth is not None and (T := truth[k]) is not None}
-    words, off = f"{'by the IMU, ' if imu else ''}{len(known)} of {len(frames)} frames", 0.0
+    known = [k for k in frames if of.attitude[k] is not None]
+    true = {k: T.rotation for k in known if of.truth is not None and (T := of.truth[k]) is not None}
+    words, off = f"{len(known)} of {len(frames)} frames", 0.0
     if len(true) > 1:
-        both = np.array([attitude[k] for k in true]), np.array(list(true.values()))
+        both = np.array([of.attitude[k] for k in true]), np.array(list(true.values()))
         # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
         turns = (np.swapaxes(R[:-1], 1, 2) @ R[1:] for R in both)
         off = math.degrees(float(np.median(angles_between(*turns))))
         words += f"; between frames it turns {off:.3g} degrees otherwise than truth"
+    words = f"by the IMU, {words}" if of.imu_axes is not None else words
     return judge("attitude", words, {"degrees off": off, "without": len(frames) - len(known)})
 
 
-def judge_up(up: Sequence[tuple[float, float, float] | None] | None, frames: Sequence[int]) -> Finding | None:
+def judge_up(of: Sequence, frames: Frames) -> Finding | None:
     """Whether the stated vertical can be one."""
-    if up is None:
+    if of.up is None:
         return None
-    known = [v for v in (up[k] for k in frames) if v is not None]
+    known = [v for v in (of.up[k] for k in frames) if v is not None]
     y = float(np.mean([v[1] for v in known])) if known else 0.0
     words = f"known of {len(known)} of {len(frames)} frames" + ("; it points down in the images" if y > 0 else "")
     return judge("up", words, {"known": len(known), "y in the images": y})
 
 
+RECORDS = (judge_times, judge_truth, judge_odometry, judge_positions, judge_attitude, judge_up)
+
+
+def _length(poses: Poses, known: Iterable[int]) -> float:
+    """Length, m, of the way through the poses of some frames, which have one."""
+    places = [T.translation for T in (poses[k] for k in known) if T is not None]
+    return sum(float(np.linalg.norm(b - a)) for a, b in pairwise(places))
+
+
+# -- what images, matches and motions show ---------------------------------------------------------------------------
+
+
 def judge_looks(
-    looks: Mapping[str, Mapping[int, Look]], names: Sequence[str], limits: FrameScreeningParams
+    looks: Mapping[str, Mapping[int, Look]], names: Series[str], limits: FrameScreeningParams
 ) -> list[Finding]:
     """Exposure and sharpness of all images, by camera and frame: what ``glance`` of stage ``image_quality`` gives.
 
@@ -346,7 +343,7 @@ def judge_looks(
 
 
 def _camera(
-    camera: str, looks: Mapping[int, Look], names: Sequence[str], limits: FrameScreeningParams
+    camera: str, looks: Mapping[int, Look], names: Series[str], limits: FrameScreeningParams
 ) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
@@ -447,7 +444,7 @@ def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:
     return judge("simultaneous", f"{words}; no right image of another time fits better")
 
 
-def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Sequence[str]) -> Finding:
+def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Series[str]) -> Finding:
     """Overlap of successive left images, of stage ``motion``'s facts."""
     if not motions:
         return judge("motion", "one frame: no trajectory")

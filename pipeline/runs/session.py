@@ -40,7 +40,7 @@ from rille.pipeline.runs import part_of_run, roots
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
-from rille.stages.core.errors import ConfigError, RilleError
+from rille.stages.core.errors import ConfigError, RilleError, within
 
 if TYPE_CHECKING:
     from rille.pipeline.runs import run_files
@@ -91,10 +91,8 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
         source = "user"
     # What suits the sequence lies beneath; a user's value always wins.
     layers = vehicle, configuration.expand(sequence.defaults)
-    try:
+    with within(f"defaults of {sequence.name}"):
         suited = configuration.build(*layers)
-    except ConfigError as error:
-        raise error.at(f"defaults of {sequence.name}") from error
     config = configuration.build(*layers, for_stages)
     given = unread.set_by_user(for_stages, config, suited)
     frames = choose_frames(options.frames, sequence.frames)

@@ -198,8 +198,8 @@ def stage(
     First come the parameters (a :class:`Params`), then the ports (a bundle, or a list of bundles; one with a default
     may be absent): each by itself, or where they are many all as the fields of one ``NamedTuple``. Then follow by
     keyword the arguments that identify a task, which travel as JSON: one that is annotated with a class that has
-    ``from_dict``, ``from_matrix`` or is a model of pydantic arrives as such an object. The docstring's first line is
-    the summary.
+    ``from_dict`` or ``from_matrix``, with a ``NamedTuple`` or a model of pydantic arrives as such an object. The
+    docstring's first line is the summary.
     ``version`` is raised when results change although the code of the module does not.
     """
 
@@ -248,6 +248,8 @@ def _reader(annotation: Any) -> Callable[[Any], Any] | None:
             if isinstance(kind, type) and hasattr(kind, name):
                 reader: Callable[[Any], Any] = getattr(kind, name)
                 return reader
+        if isinstance(kind, type) and hasattr(kind, "_asdict"):  # a NamedTuple of plain values
+            return lambda given, kind=kind: kind(**given)  # type: ignore[misc]
     return None
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Self
 
 
@@ -31,6 +32,17 @@ class RilleError(Exception):
     def at(self, where: str) -> Self:
         """Return the same error with the place in front: ``where: message``."""
         return type(self)(self.code, f"{where}: {self.message}", remedy=self.remedy)
+
+
+@contextmanager
+def within(where: str) -> Iterator[None]:
+    """Put the place in front of what is raised inside, unless it is there."""
+    try:
+        yield
+    except RilleError as error:
+        if error.message.startswith(where):
+            raise
+        raise error.at(where) from error
 
 
 def did_you_mean(text: str, names: Iterable[str], prefix: str = "") -> str:

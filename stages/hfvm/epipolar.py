@@ -176,8 +176,7 @@ def on_line(line, along):  # type: ignore[no-untyped-def]
     return along * b - c * a, -along * a - c * b
 
 
-@njit(cache=True, nogil=True)
-def lines_at(f, x, y):  # type: ignore[no-untyped-def]
+def lines_at(f: Matrix, x: AnyArray, y: AnyArray) -> NDArray[np.float32]:
     """As :func:`lines`, of single pixels (n,): (3, n) float32."""
     a, b, c = product(f, x, y)
     # Without a band all is zero, and 0 / 0 must stay 0.
@@ -197,17 +196,14 @@ def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
     return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 
-@njit(cache=True, nogil=True)
-def settled(f, u, v, wanted):  # type: ignore[no-untyped-def]
+def settled(f: Matrix, u: AnyArray, v: AnyArray, wanted: AnyArray) -> AnyArray:
     """Row displacements (row, col), those of the ``wanted`` pixels by their column displacements and their lines.
 
     Only where lines run along the rows rather than along the columns: there an error of the column is not enlarged.
     """
-    out = v.copy()
-    for y in range(v.shape[0]):
-        for x in range(v.shape[1]):
-            if wanted[y, x]:
-                a, b, c = product(f, x, y)
-                if abs(b) > abs(a):
-                    out[y, x] = -(a * (x + u[y, x]) + c) / b - y
+    out, (y, x) = v.copy(), np.nonzero(wanted)
+    a, b, c = product(f, x, y)
+    along = np.abs(b) > np.abs(a)
+    a, b, c, x, y = (values[along] for values in (a, b, c, x, y))
+    out[y, x] = -(a * (x + u[y, x]) + c) / b - y
     return out

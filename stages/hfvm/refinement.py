@@ -109,24 +109,13 @@ def refine(
         step_u, step_v, rest, per_noise = planes
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
-    _take_back(start, rests[0], now, rests[-1])
+    # Start displacements and residuals where steps led far or away from a fit. Residuals are those before a step: after
+    # a single one the last is the first, and the distance alone counts.
+    du, dv = now[0] - start[0], now[1] - start[1]
+    worse = ~((rests[-1] <= rests[0]) & (du * du + dv * dv <= np.float32(MAX_CORRECTION_PX**2)))
+    for values, before in zip((*now, rests[-1]), (*start, rests[0]), strict=True):
+        np.copyto(values, before, where=worse)
     return Refined(*now, rests[-1], per_noise)
-
-
-@njit(cache=True, nogil=True)
-def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
-    """Start displacements and residuals where steps led far or away from a fit.
-
-    Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
-    """
-    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX**2)
-    for y in range(u.shape[0]):
-        for x in range(u.shape[1]):
-            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
-            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest)
-            new_u[y, x] = new_u[y, x] if better else u[y, x]
-            new_v[y, x] = new_v[y, x] if better else v[y, x]
-            last[y, x] = last[y, x] if better else first[y, x]
 
 
 @njit(cache=True, nogil=True)
@@ -344,8 +333,8 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
     for soft in (True, True, False, False):
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
         grey = _grey(images, u, v, keep)
-        stiff, normal = np.zeros((2, *u.shape), np.float32), np.zeros((5, *u.shape), np.float32)
-        _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness), stiff)
+        stiff = _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness))
+        normal = np.zeros((5, *u.shape), np.float32)
         _normal(grey, u, v, holds, keep, stiff, normal)
         u, v = _relax(normal, stiff, u, v)
     if trust > 0:
@@ -398,23 +387,16 @@ def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArra
     return u - e * lines[..., 0], v - e * lines[..., 1]
 
 
-@njit(cache=True, nogil=True)
-def _stiffness(u, v, keep, bend, stiffness, out):  # type: ignore[no-untyped-def]
-    """Weight of the second difference at each pixel along its row and column, 0 where a neighbour is unknown."""
-    rows, cols = u.shape
-    across, down = out
-    for y in range(rows):
-        for x in range(cols):
-            if not keep[y, x]:
-                continue
-            if x > 0 and x < cols - 1 and keep[y, x - 1] and keep[y, x + 1]:
-                d = u[y, x - 1] - u[y, x] + u[y, x + 1] - u[y, x]
-                e = v[y, x - 1] - v[y, x] + v[y, x + 1] - v[y, x]
-                across[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
-            if y > 0 and y < rows - 1 and keep[y - 1, x] and keep[y + 1, x]:
-                d = u[y - 1, x] - u[y, x] + u[y + 1, x] - u[y, x]
-                e = v[y - 1, x] - v[y, x] + v[y + 1, x] - v[y, x]
-                down[y, x] = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+def _stiffness(u: AnyArray, v: AnyArray, keep: AnyArray, bend: np.float32, stiffness: np.float32) -> AnyArray:
+    """Weights (2, row, col) of the second difference at each pixel along its row and column, 0 where a neighbour is
+    unknown."""
+    planes = np.zeros((2, *u.shape), np.float32)
+    before, here, after = slice(None, -2), slice(1, -1), slice(2, None)
+    for out, a, b, there in ((planes[0], u, v, keep), (planes[1].T, u.T, v.T, keep.T)):
+        d, e = (m[:, before] - m[:, here] + m[:, after] - m[:, here] for m in (a, b))
+        weight = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
+        np.copyto(out[:, here], weight, where=there[:, before] & there[:, here] & there[:, after])
+    return planes
 
 
 @njit(cache=True, nogil=True)

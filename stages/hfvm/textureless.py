@@ -359,17 +359,7 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     planes = np.linalg.solve(t.T[three] + 1e-6 * np.eye(3), d[three][..., None])[..., 0]
     # Should all be steep, the flat one is left.
     planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= MAX_SLOPE).all(axis=1)]])
-    g = planes[np.argmax(_support(planes, t, d, weight.astype(np.int64)))]
+    near = np.abs(sum(g[:, None] * term for g, term in zip(planes.T, t, strict=True)) - d) <= MAX_VOTE_DISTANCE_PX
+    g = planes[np.argmax(near @ weight)]
     g = irls(t.T, d, lambda error: weight * cauchy(error, MAX_VOTE_DISTANCE_PX) ** 2, 1e-6 * np.eye(3), g, rounds=10)
     return g, np.abs(g @ terms - step)
-
-
-@njit(cache=True, nogil=True)
-def _support(planes, terms, step, votes):  # type: ignore[no-untyped-def]
-    """Votes (n,) of the steps that are near each plane; whole numbers, which are added up several at once."""
-    totals = np.zeros(len(planes), np.int64)
-    for n in range(len(planes)):
-        g = planes[n]
-        off = g[0] * terms[0] + g[1] * terms[1] + g[2] * terms[2] - step
-        totals[n] = (votes * (np.abs(off) <= MAX_VOTE_DISTANCE_PX)).sum()
-    return totals

@@ -15,7 +15,7 @@ from numba import njit
 
 from rille.stages.core.arrays import Bytes, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey, usable
@@ -121,10 +121,8 @@ def undistort_stage(
     params: NoParams, image: Bundle, *, lens: Lens, camera: Camera, frame: int, camera_name: str
 ) -> Bundle:
     """One image with its lens distortion removed."""
-    try:
+    with within(f"frame {frame}, {camera_name} camera"):
         ideal, valid = undistort(image["image"], lens, camera, image["valid"])
-    except InputError as error:
-        raise error.at(f"frame {frame}, {camera_name} camera") from error
     arrays: dict[str, AnyArray] = {"image": ideal, "valid": valid}
     if "colour" in image.arrays:
         bands = [undistort(band, lens, camera)[0] for band in np.moveaxis(image["colour"], 2, 0)]

@@ -123,7 +123,7 @@ def test_markers_stand_somewhere_in_the_body(flight):
     write(flight / "mav0" / "vicon0" / "data.csv", poses(T_BODY_MARKER, times))
     s = opened(flight)
     assert s.truth is None
-    assert [line[:7] for line in s.warnings] == ["RIL-685"]
+    assert [line[:7] for line in s.warnings] == ["RIL-683"]
     write(flight / "mav0" / "vicon0" / "sensor.yaml", sensor(T_BODY_MARKER, camera=False))
     s = opened(flight)
     np.testing.assert_allclose(s.truth[3].matrix34, (body(0.15) @ T_BODY_LEFT).matrix34, atol=1e-6)

@@ -112,12 +112,7 @@ class Inspection:
         self.say(*(Finding("", line, "input", "WARN") for line in s.warnings))  # it begins with its code
         self.say(*(Finding("", line, "input") for line in s.notes))
         self.say(judge.judge_rig(s.rig))
-        self.say(judge.judge_times(None if s.times is None else [s.times[k] for k in self.frames]))
-        self.say(judge.judge_truth(s.truth, self.frames, s.truth_positions))
-        self.say(judge.judge_odometry(s.odometry, s.truth, s.times, self.frames))
-        self.say(judge.judge_positions(s.priors.get("positions"), s.times, self.frames))
-        self.say(judge.judge_attitude(s.attitude, s.truth, self.frames, imu=s.imu_axes is not None))
-        self.say(judge.judge_up(s.up, self.frames))
+        self.say(*(records(s, self.frames) for records in judge.RECORDS))
         yield from self._images()
         whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
         if not whole:

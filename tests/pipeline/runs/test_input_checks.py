@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from rille.datasets.protocol import Positions
+from rille.datasets.protocol import Positions, Sequence
 from rille.pipeline.runs import input_checks
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.odometry.frame_screening import FrameScreeningParams
@@ -49,13 +49,22 @@ def test_a_camera_of_another_size_is_stated_and_no_mistake():
     assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 80.0, 60.0, 160, 120))).level == "WARN"
 
 
+def recorded(frames: int, **known) -> tuple[Sequence, range]:
+    """A sequence of which something is known, and its frames."""
+    names = tuple(map(str, range(frames)))
+    return Sequence("one", rig(-0.1), frames, lambda frame, camera: None, names, **known), range(frames)
+
+
 def test_times():
-    assert input_checks.judge_times(None).level == input_checks.judge_times([3.0]).level == "OK"
-    assert "10 frames a second over 0.3 s" in input_checks.judge_times([0.0, 0.1, 0.2, 0.3]).text
-    gap = input_checks.judge_times([0.0, 0.1, 0.2, 0.6, 0.7])
+    def judged(*times: float):
+        return input_checks.judge_times(*recorded(len(times), times=times))
+
+    assert input_checks.judge_times(*recorded(2)).level == judged(3.0).level == "OK"
+    assert "10 frames a second over 0.3 s" in judged(0.0, 0.1, 0.2, 0.3).text
+    gap = judged(0.0, 0.1, 0.2, 0.6, 0.7)
     assert gap.level == "WARN"
     assert "0.4 s from frame 2 to 3" in gap.text
-    back = input_checks.judge_times([0.0, 0.1, 0.1, 0.2])
+    back = judged(0.0, 0.1, 0.1, 0.2)
     assert back.level == "FAIL"
     assert "frame 1 to 2" in back.text
 
@@ -65,13 +74,13 @@ def poses(count: int) -> list[RigidTransform]:
 
 
 def test_truth_coverage_and_length():
-    assert "none" in input_checks.judge_truth(None, [0]).text
+    assert "none" in input_checks.judge_truth(*recorded(1)).text
     places = Positions(((0.0, 0.0), (3.0, 4.0)), (0.0, 1.0))
-    alone = input_checks.judge_truth(None, range(4), places)
+    alone = input_checks.judge_truth(*recorded(4, truth_positions=places))
     assert (alone.level, "positions only" in alone.text, "5 m" in alone.text) == ("OK", True, True)
-    full = input_checks.judge_truth(poses(4), range(4))
+    full = input_checks.judge_truth(*recorded(4, truth=poses(4)))
     assert (full.level, full.text) == ("OK", "4 of 4 frames, 6 m")
-    part = input_checks.judge_truth([*poses(3), None], range(4))
+    part = input_checks.judge_truth(*recorded(4, truth=[*poses(3), None]))
     assert part.level == "WARN"
     assert "3 of 4" in part.text
 
@@ -82,13 +91,17 @@ def test_attitude_against_truth():
     reference = rotation_exp([0.3, -0.2, 1.0])  # any inertial frame
     turned = [tuple(map(tuple, reference @ T.rotation)) for T in truth]
     inverse = [tuple(map(tuple, T.rotation.T)) for T in truth]
-    assert input_checks.judge_attitude(None, truth, range(4)) is None
-    assert input_checks.judge_attitude(right, truth, range(4)).level == "OK"
-    assert input_checks.judge_attitude(turned, truth, range(4)).level == "OK"
-    wrong = input_checks.judge_attitude(inverse, truth, range(4))
+
+    def judged(attitude):
+        return input_checks.judge_attitude(*recorded(4, truth=truth, attitude=attitude))
+
+    assert judged(None) is None
+    assert judged(right).level == "OK"
+    assert judged(turned).level == "OK"
+    wrong = judged(inverse)
     assert wrong.level == "FAIL"
     assert f"{2 * math.degrees(0.1):.1f} degrees" in wrong.text
-    assert input_checks.judge_attitude([*right[:3], None], truth, range(4)).level == "WARN"
+    assert judged([*right[:3], None]).level == "WARN"
 
 
 def ahead(*z: float | None) -> list[RigidTransform | None]:
@@ -107,10 +120,11 @@ def ahead(*z: float | None) -> list[RigidTransform | None]:
     ],
 )
 def test_odometry_has_a_length_and_a_speed(z, times, level, words):
-    found = input_checks.judge_odometry(ahead(*z), ahead(0.0, 1.0, 2.0), times, range(3))
+    known = {"odometry": ahead(*z), "truth": ahead(0.0, 1.0, 2.0), "times": times}
+    found = input_checks.judge_odometry(*recorded(3, **known))
     assert found.level == level
     assert words in found.text
-    assert input_checks.judge_odometry(None, None, times, range(3)) is None
+    assert input_checks.judge_odometry(*recorded(3, times=times)) is None
 
 
 @pytest.mark.parametrize(
@@ -124,17 +138,18 @@ def test_odometry_has_a_length_and_a_speed(z, times, level, words):
 )
 def test_positions_are_counted_within_the_time_of_the_images(change, level, words):
     measured = {"times": [0.5 * k for k in range(6)], "positions": [[k, 0.0] for k in range(6)], "sigma": [0.1] * 3}
-    found = input_checks.judge_positions({**measured, **change}, (0.0, 1.0, 2.0), range(3))
+    known = {"priors": {"positions": {**measured, **change}}, "times": (0.0, 1.0, 2.0)}
+    found = input_checks.judge_positions(*recorded(3, **known))
     assert found.level == level
     assert words in found.text
-    assert input_checks.judge_positions(None, None, range(3)) is None
+    assert input_checks.judge_positions(*recorded(3)) is None
 
 
 def test_up_points_up():
-    assert input_checks.judge_up(None, [0]) is None
-    assert input_checks.judge_up([(0.0, -1.0, 0.0)], [0]).level == "OK"
-    assert input_checks.judge_up([(0.0, 1.0, 0.0)], [0]).level == "WARN"
-    assert input_checks.judge_up([None], [0]).level == "WARN"
+    assert input_checks.judge_up(*recorded(1)) is None
+    assert input_checks.judge_up(*recorded(1, up=[(0.0, -1.0, 0.0)])).level == "OK"
+    assert input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)])).level == "WARN"
+    assert input_checks.judge_up(*recorded(1, up=[None])).level == "WARN"
 
 
 def looks(left: list[dict[str, float]], right: list[dict[str, float]]):

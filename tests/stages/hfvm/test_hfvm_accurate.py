@@ -272,9 +272,7 @@ def test_sweeps_converge_to_the_minimum():
     u, v = np.where(keep, rng.normal(0, 1, (2, *shape)), 0).astype(float32)
     grey = rng.normal(0, 4, (4, *shape)).astype(float32)
     grey[0] = np.where(keep, rng.uniform(0.2, 1, shape), 0)
-    stiff = np.zeros((2, *shape), float32)
-    refinement._stiffness(u, v, keep, float32(2.0), float32(30.0), stiff)
-    across, down = stiff
+    across, down = stiff = refinement._stiffness(u, v, keep, float32(2.0), float32(30.0))
     direction = rng.uniform(0, np.pi, shape)
     lines = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 1, shape)], -1).astype(float32)
     hold, own = float32(50.0), np.arange(n).reshape(shape)
