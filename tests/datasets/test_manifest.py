@@ -531,6 +531,11 @@ def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
     ("text", "lines", "expected"),
     [
         ('[truth]\nfile = "p.txt"\n', ["1 0 0 0 0 1 0 0 0 0 1 0"], ("RIL-230",)),
+        (
+            '[truth]\nfile = "p.txt"\n',
+            ["frame time,qw,qx,qy,qz", "7,1,0,0,0"],
+            ("RIL-230", "frame time", "is called time"),
+        ),
         ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti")),
         ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-138", "nothing.txt")),
     ],
