@@ -18,7 +18,7 @@ import scipy
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.imu_check import signed_axes
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
-from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread
+from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread, standing_out
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
@@ -129,10 +129,10 @@ def _jumps(P: Floats, Q: Floats, sigma: float) -> list[str]:
     which it fits; ``sigma``, m, of a position of P."""
     moved, said = (compose(inverse(T[:-1]), T[1:]) for T in (P, Q))
     off = np.linalg.norm(moved[:, :, 3] - said[:, :, 3], axis=1)
-    jumps = np.flatnonzero(off > max(10.0 * np.median(off), 3.0 * sigma))
+    jumps = np.flatnonzero(standing_out(off, 3.0 * sigma))
     said[jumps] = moved[jumps]
     steady = np.array(list(accumulate(said, compose, initial=Q[0])))
-    if not 0 < len(jumps) < len(off) / 3 or _misfit(P, steady) > MAX_SHARE * _misfit(P, Q):
+    if not len(jumps) or _misfit(P, steady) > MAX_SHARE * _misfit(P, Q):
         return []
     text = (
         f"behind {jumps[0] + 1} of its {len(Q)} poses, usually by {np.median(off):.2g} m: correct or remove poses there"

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
-from rille.stages.geometry.rigid import compose, motion, posed, umeyama
-from rille.stages.odometry.pose_graph import MAJORITY, Factors
+from rille.stages.geometry.rigid import compose, motion, posed, standing_out, umeyama
+from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
 """Of each component of a lever arm that is stated."""
@@ -106,11 +106,9 @@ def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
 
 def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[float, str]:
     """By which share vectors (m, 3) of a sensor depart from the camera's; how, where it is more than allowed."""
-    apart = np.linalg.norm(own - said, axis=1)
     # The adjustment leaves out single ones that stand out, as of a jump.
-    usual = apart <= 10.0 * np.median(apart)
-    if usual.mean() >= MAJORITY:
-        own, said = own[usual], said[usual]
+    usual = ~standing_out(np.linalg.norm(own - said, axis=1))
+    own, said = own[usual], said[usual]
     size = math.sqrt(float((own**2).sum()))
     off = math.sqrt(float(((own - said) ** 2).sum())) / max(size, 1e-12)
     if off <= allowed:
@@ -302,8 +300,8 @@ class PositionPrior:
             share = float(np.hypot(*self.sigma[:2])) / math.sqrt(float((way**2).sum(1).mean()))
             off, why = departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways")
             steps = np.linalg.norm(np.diff(way - said, axis=0), axis=1)
-            at = int(steps.argmax())
-            if why and steps[at] > 10.0 * np.median(steps):
+            if why and standing_out(steps).any():
+                at = int(steps.argmax())
                 x, y = fixes.positions[mine][at, :2]
                 why += f"; they jump by {steps[at]:.2g} m behind ({x:.2f}, {y:.2f})"
             found.append((off, why))
