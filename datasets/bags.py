@@ -254,8 +254,8 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
         return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
     (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
     rig, lenses = rig_of(left, right, sizes)
-    check_baseline(rig.baseline, RigSection(), str(path))
-    return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
+    doubts = check_baseline(rig.baseline, RigSection(), str(path))
+    return Optics(rig, lenses, None, (*doubts, *unusual_cameras((left, right), sizes))), turned
 
 
 def _beside(topic: str) -> str:
