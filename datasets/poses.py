@@ -249,8 +249,11 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
     # Few rows may be such numbers by chance.
     if step < 0.01 or len(places) < MIN_ROUNDED:
         return ()
-    text = f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0"
-    return (warning("RIL-709", f"{text}: write them in double precision, or less a constant"),)
+    line = (
+        f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0: write "
+        "them in double precision, or less a constant"
+    )
+    return (warning("RIL-709", line),)
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:

@@ -112,7 +112,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
             found = read_fields(fields, path)
             fields.check_lens()
             return found
-    whose, remedy = next(
-        ((f", but {name}", remedy) for known, name, remedy in FOREIGN if known.search(text)), ("", KNOWN)
-    )
-    raise InputError("RIL-100", f"{path} holds no camera that is known{whose}", remedy=remedy)
+    for known, whose, remedy in FOREIGN:
+        if known.search(text):
+            raise InputError("RIL-101", f"{path} is {whose}, which is not read", remedy=remedy)
+    raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)
