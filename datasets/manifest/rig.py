@@ -221,8 +221,8 @@ def check_baseline(baseline: float, section: RigSection, name: str) -> list[str]
         raise InputError("RIL-244", text, remedy=remedy)
     if baseline > USUAL_BASELINE and from_files and "unit" not in section.model_fields_set:
         line = (
-            f"{name}: the baseline is {baseline:g} m: is the calibration's unit the metre, not a centimetre or a square "
-            "of the chessboard? rig.unit states its length in metres, 1 keeps it"
+            f"{name}: the baseline is {baseline:g} m: is the calibration's unit the metre, not a centimetre or a "
+            "square of the chessboard? rig.unit states its length in metres, 1 keeps it"
         )
         return [warning("RIL-716", line)]
     return []
