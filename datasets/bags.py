@@ -256,8 +256,8 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
     (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
     rig, lenses = rig_of(left, right, sizes)
     with within(str(path)):
-        check_baseline(rig.baseline, RigSection())
-    return Optics(rig, lenses, None, unusual_cameras((left, right), sizes)), turned
+        doubts = check_baseline(rig.baseline, RigSection())
+    return Optics(rig, lenses, None, (*doubts, *unusual_cameras((left, right), sizes))), turned
 
 
 def _beside(topic: str) -> str:

@@ -51,6 +51,9 @@ IMAGES = ("image", *QUATERNION, *POSITION, "camera", "name")
 IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 """Line of an image in a model of COLMAP, where the name is that of an image."""
 
+MIN_ROUNDED = 4
+"""Rows from which on coordinates tell their precision."""
+
 WITHIN = 1e-6
 """s; times that agree to this are the same."""
 
@@ -62,7 +65,7 @@ WORDS = (
         lambda m: "time",
     ),
     # Tools of ROS write the path of a field before its name.
-    (re.compile(r"(.*[./])?(q|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
+    (re.compile(r"(.*[./])?(q|r|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
@@ -143,7 +146,9 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
             lost |= _at_origin(table.values([columns[name] for name in (*POSITION, "qx", "qy", "qz")]))
         table, warnings = table.measured(list(columns.values()), lost)
     times = times_of(table, columns["time"]) if "time" in columns else None
-    return TimedPoses(times, _posed(table, columns, unit), table.name, warnings)
+    poses = _posed(table, columns, unit)
+    warnings += _rounded(np.array([pose.translation for pose in poses]), table.name)
+    return TimedPoses(times, poses, table.name, warnings)
 
 
 def _at_origin(values: Floats) -> Bools:
@@ -232,7 +237,23 @@ def positions_of(
         table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
         times = times_of(table, meant["time"])
     rows = _lengths(table, placed, unit)
+    warnings += _rounded(rows, table.name)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+
+
+def _rounded(places: Floats, name: str) -> tuple[str, ...]:
+    """Warn of coordinates (n, 2 or 3), m, that are numbers of single precision, rounded to centimetres or worse."""
+    single = places.astype(np.float32)
+    rounded = (places == single).all(axis=0) & (np.ptp(places, axis=0) > 0)
+    step = float(np.spacing(np.abs(single).max(axis=0))[rounded].max(initial=0.0))
+    # Few rows may be such numbers by chance.
+    if step < 0.01 or len(places) < MIN_ROUNDED:
+        return ()
+    line = (
+        f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0: write "
+        "them in double precision, or less a constant"
+    )
+    return (warning("RIL-709", line),)
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:

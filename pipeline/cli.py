@@ -133,7 +133,10 @@ def _run(argv: list[str] | None) -> int:
         extra = isinstance(error, UnusedCliTokensError)
         text = f"unexpected {', '.join(map(repr, error.unused_tokens or ()))}." if extra else str(error)
         hint = f" `{words} --help` says what it takes." if extra or isinstance(error, MissingArgumentError) else ""
-        print_error("RIL-001", f"{text}{hint}")
+        dashed = [
+            f" The path {word} is given as ./{word}." for word in tokens if word[:1] == "-" and os.path.lexists(word)
+        ]
+        print_error("RIL-001", f"{text}{hint}{''.join(dashed)}")
         return USAGE
     except BrokenPipeError:
         raise

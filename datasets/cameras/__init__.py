@@ -23,6 +23,20 @@ KNOWN = (
     "CAHVORE) are read"
 )
 
+FOREIGN = (
+    (
+        re.compile("CameraParameters1|TranslationOfCamera2|PoseCamera2"),
+        "MATLAB's stereoParameters",
+        "write K1, D1, K2, D2, R, T as OpenCV's YAML (IntrinsicMatrix and RotationOfCamera2 transposed, T in metres)",
+    ),
+    (
+        re.compile(r"<chunk|<calibration>\s*<projection>"),
+        "Metashape's",
+        "save each camera as OpenCV's XML (Tools, Camera Calibration, Save), and state rig.baseline or T_right_left",
+    ),
+)
+"""Files that are known and not read: a pattern, whose they are, and how to write what is read."""
+
 Text: TypeAlias = Callable[[str], bool]
 Entries: TypeAlias = Callable[[Fields], bool]
 
@@ -98,4 +112,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
             found = read_fields(fields, path)
             fields.check_lens()
             return found
+    for known, whose, remedy in FOREIGN:
+        if known.search(text):
+            raise InputError("RIL-101", f"{path} is {whose}, which is not read", remedy=remedy)
     raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)

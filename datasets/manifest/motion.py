@@ -209,7 +209,8 @@ class MotionReader:
             poses = tuple(one_a_pair)
         else:
             text = f"{table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
-            raise IncompleteError("RIL-230", text, remedy="give one a pair, or poses with times")
+            named = f"; of its columns ({', '.join(rows.header)}) none is called time" if rows.header else ""
+            raise IncompleteError("RIL-230", text + named, remedy="give one a pair, or poses with times")
         if section.T_body_left is None:
             return poses
         T_body_left = RigidTransform.from_matrix(section.T_body_left)

@@ -18,8 +18,8 @@ from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
-LONGEST_BASELINE = 20.0
-"""m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
+USUAL_BASELINE, LONGEST_BASELINE = 1.5, 20.0
+"""m; few vehicles carry a longer one than the first, none than the second, but 97 (mm) is a common slip."""
 
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
@@ -71,7 +71,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
         raise InputError("RIL-021", text, remedy="estimate it from runs with this calibration")
-    check_baseline(rig.baseline, manifest.rig)
+    lines += check_baseline(rig.baseline, manifest.rig)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = "the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
@@ -205,14 +205,21 @@ def _stated(section: RigSection) -> RigidTransform | None:
     return None if section.baseline is None else parallel(section.baseline)
 
 
-def check_baseline(baseline: float, section: RigSection) -> None:
-    """Refuse a length (m) that looks like one in another unit, unless the unit is stated."""
+def check_baseline(baseline: float, section: RigSection) -> list[str]:
+    """Refuse a length (m) that looks like one in another unit, or warn of it, unless the unit is stated."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"
         remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
         raise InputError("RIL-244", text, remedy=remedy)
+    if baseline > USUAL_BASELINE and from_files and "unit" not in section.model_fields_set:
+        line = (
+            f"the baseline is {baseline:g} m: is the calibration's unit the metre, not a centimetre or a "
+            "square of the chessboard? rig.unit states its length in metres, 1 keeps it"
+        )
+        return [warning("RIL-716", line)]
+    return []
 
 
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:

@@ -169,6 +169,8 @@ def refuse_decimal_commas(lines: list[str], path: Path, cause: Exception | None 
     InputError
         It is so.
     """
+    if "".join(lines[:SAMPLE]).lstrip().startswith("{"):
+        return  # of JSON, whose commas part numbers, with or without a blank
     sample = enumerate((line[:LONGEST_LINE] for line in lines[:SAMPLE]), start=1)
     words = [(k, word) for k, line in sample for word in BETWEEN.split(line)]
     commas = [(k, word) for k, word in words if COMMA.fullmatch(word)]

@@ -1,7 +1,8 @@
-"""Whether matches fit the rig better once the coefficients of the lenses are read otherwise.
+"""Whether matches fit the rig better once the coefficients of the lenses, or R between the cameras, are read otherwise.
 
 Programs write the same numbers in different orders, and under the names of different models. A wrong reading bends
-the epipolar lines by pixels, which no rotation of a camera explains.
+the epipolar lines by pixels, which no rotation of a camera explains. MATLAB's rotations are transposed: they multiply
+rows.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import numpy as np
 
 from rille.stages.calibration.relative_orientation import RIG, PointPairs
 from rille.stages.geometry.epipolar import distances
-from rille.stages.geometry.geometry import Rig
+from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
+
+TRANSPOSED = "it is transposed"
 
 
 def readings(lens: Lens) -> dict[str, Lens]:
@@ -29,7 +32,7 @@ def readings(lens: Lens) -> dict[str, Lens]:
 
 
 def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPairs]) -> str:
-    """By which reading of the coefficients the matches lie nearer to their epipolar lines, in words; empty: by none.
+    """By which reading of the calibration the matches lie nearer to their epipolar lines, in words; empty: by none.
 
     Parameters
     ----------
@@ -39,7 +42,7 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
     ideal = {"left": rig.left, "right": rig.right}
     points = {side: np.concatenate([getattr(m, side) for m in pairs]) for side in ideal}
 
-    def off(by: Mapping[str, Lens]) -> float:
+    def off(by: Mapping[str, Lens], rig: Rig = rig) -> float:
         """Median distance, pixels, of the matches from their lines, their raw pixels undistorted by these lenses."""
         at = {s: by[s].undistort(lenses[s].distort(points[s], ideal[s]), ideal[s]) for s in ideal}
         return float(np.nanmedian(np.abs(distances(rig, np.zeros(RIG), *at.values())[0])))
@@ -51,11 +54,14 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
     other = {side: readings(lens) for side, lens in lenses.items()}
     names = {name: None for found in other.values() for name in found}
     both = {name: off({s: other[s].get(name, lenses[s]) for s in ideal}) for name in names}
+    between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
+    both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
     name, least = min(both.items(), key=lambda item: item[1], default=("", given))
     # Half of it: no reading is so much better by chance.
     if least > min(0.5 * given, 0.3):
         return ""
+    what = "R between the cameras seems" if name == TRANSPOSED else "the coefficients of the lenses seem"
     return (
-        "the coefficients of the lenses seem misread: the matches lie "
+        f"{what} misread: the matches lie "
         f"{given:.2f} px off their epipolar lines (median) as given, {least:.2f} px if {name}"
     )

@@ -227,10 +227,13 @@ def accuracy_stage(
     both = posed(estimate) & posed(true)
     if claimed is not None and both.any():
         stated = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
-        warnings = better_reading(estimate[both], true[both], source.mount, stated)
-        off = None if warnings else hand_eye(estimate, true)
+        off = hand_eye(estimate, true)
+        mounted = None if off is None else rigid.compose(true[both], off)
+        warnings = better_reading(estimate[both], true[both], source.mount, stated, mounted)
+        off = None if warnings else off
         late = None
-        if source.record is not None and not warnings:
+        # Within what the estimate states of itself another clock fits its own errors.
+        if source.record is not None and not warnings and float(figures["ate_rmse"]["value"] or 0.0) > stated:
             late = late_truth(np.array(source.moments), estimate[:, :, 3], source.record)
         if off is not None:
             _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, *source.sigmas)

@@ -22,11 +22,11 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.evaluation.accuracy import counts, over_length
 from rille.stages.evaluation.reading.clock import MIN_FRAMES, Offset, TruePositions, find_offset
-from rille.stages.evaluation.reading.conventions import UNITS
+from rille.stages.evaluation.reading.conventions import MUCH, UNITS
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
-from rille.stages.geometry.rigid import by_frame, fit_rigid, in_both, rms
+from rille.stages.geometry.rigid import Fit, by_frame, fit_rigid, in_both, rms, standing_out
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MAX_ERROR_SHARE = 0.5
@@ -37,11 +37,13 @@ MEASURED_VERTICAL = "attitude"
 
 
 class Comparison(NamedTuple):
-    """True positions (frame, 2 or 3) in the world, NaN where there are none, less the lever arm; figures; warnings."""
+    """True positions (frame, 2 or 3) in the world, NaN where there are none, less the lever arm; figures; warnings;
+    whether they fit the trajectory as they were read."""
 
     truth: Floats
     metrics: dict[str, Metric]
     warnings: list[str]
+    fits: bool = True
 
 
 def position_accuracy(
@@ -57,7 +59,8 @@ def position_accuracy(
     upright : whether the world's vertical was measured; else truth with heights is fitted in space.
     """
     without = _compared(poses, truth, moments, upright)
-    if truth.lever_arm is not None or without.metrics["frames_judged"]["value"] < MIN_LEVER_FRAMES:
+    few = without.metrics["frames_judged"]["value"] < MIN_LEVER_FRAMES
+    if truth.lever_arm is not None or few or not without.fits:
         return without
     lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)
@@ -90,17 +93,43 @@ def _compared(poses: Floats, truth: TruePositions, moments: Floats | None, uprig
             f"offset in time of the truth: not determined{kept}; from {offset.low:.2f} to {offset.high:.2f} s the "
             "tracks agree about as well: the motion changes too little"
         )
-    fit, both, width = fit_rigid(antenna, there, upright), in_both(antenna, there), there.shape[1]
+    fit, both, width, doubt = fit_rigid(antenna, there, upright), in_both(antenna, there), there.shape[1], ""
     if both.sum() >= MIN_FRAMES:
         others = {words: fit_rigid(antenna, axes, upright) for words, axes in _otherwise(there).items()}
         best = min(others, key=lambda words: others[words].error)
         if others[best].error < MAX_ERROR_SHARE * fit.error and others[best].relative < MAX_ERROR_SHARE:
-            warnings.append(f"true positions fit far better {best}")
+            doubt = f"fit far better {best}"
+        else:
+            doubt = _jump(antenna[both, :width], fit.moved[both], upright) or _misfit(fit)
+    warnings += [f"true positions {doubt}"] if doubt else []
     where = "in the plane" if upright or width == 2 else "in space, since the vertical was not measured"
     # Of the camera, as the estimate is; where it has no pose, of the antenna.
     moved = fit.moved - np.nan_to_num(arm[:, :width])
     figures = _figures(poses[:, :, 3], moved, f"positions only, after a rigid fit {where}, {clock}")
-    return Comparison(moved, figures | (_clock(offset) if offset else {}), warnings)
+    return Comparison(moved, figures | (_clock(offset) if offset else {}), warnings, not doubt)
+
+
+def _jump(antenna: Floats, truth: Floats, upright: bool) -> str:
+    """That few steps of the true positions (n, 2 or 3) depart from the antenna's, and explain most of what is left."""
+    off = np.diff(truth - antenna, axis=0)
+    jumps = standing_out(np.linalg.norm(off, axis=1))
+    steady = truth.copy()
+    steady[1:] -= np.cumsum(np.where(jumps[:, None], off, 0.0), axis=0)
+    target = np.pad(antenna, ((0, 0), (0, 3 - antenna.shape[1])))
+    left, error = (fit_rigid(target, source, upright).error for source in (steady, truth))
+    if not jumps.any() or left > MAX_ERROR_SHARE * error:
+        return ""
+    at, size = int(jumps.argmax()), float(np.linalg.norm(off[jumps.argmax()]))
+    text = f"jump by {size:.2g} m against the trajectory behind {at + 1} of {len(truth)} of them: {error:.2g} m RMS are"
+    return f"{text} left, without that {left:.2g} m: correct or remove rows there, unless it is the trajectory's error"
+
+
+def _misfit(fit: Fit) -> str:
+    """That what the best fit leaves is no error of an estimate."""
+    if fit.relative < MUCH:
+        return ""
+    text = f"do not fit the trajectory: {fit.error:.2g} m RMS are left, {fit.relative:.0%} of both extents"
+    return f"{text}: are they of this drive, and are their columns and times, and the order of the images, right?"
 
 
 def _otherwise(truth: Floats) -> dict[str, Floats]:
@@ -108,6 +137,9 @@ def _otherwise(truth: Floats) -> dict[str, Floats]:
     mirrored = truth * np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
     readings = {"mirrored: x and y may be swapped; seen from above y lies left of x": mirrored}
     readings |= {f"in units of {unit:g} m: state truth.unit = {unit:g}": unit * truth for unit in UNITS}
+    # Metres of a degree of latitude and, on average of where people drive, of longitude.
+    degrees = truth * np.array([1e5, 1e5, 1.0])[: truth.shape[1]]
+    readings["as degrees of latitude and longitude: project them to metres, as UTM has them"] = degrees
     if truth.shape[1] == 3:
         # Cameras have x to the right, y down and z ahead; their positions are often given in the first one's frame.
         upright = truth[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])

@@ -123,6 +123,12 @@ def fit_rigid(target: Floats, source: Floats, upright: bool = True) -> Fit:
     return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
 
 
+def standing_out(lengths: Floats, least: float = 0.0) -> Bools:
+    """Which lengths (n,) are above ten times their median and ``least``, as of jumps; none where three in ten are."""
+    far = lengths > max(10.0 * float(np.median(lengths)), least)
+    return np.asarray(far & (far.mean() < 0.3))
+
+
 def in_both(a: Floats, b: Floats) -> Bools:
     """Rows (n,) that are there, i.e. without NaN, in both sets of positions (n, 2 or 3)."""
     return np.asarray(np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))

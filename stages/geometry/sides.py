@@ -56,6 +56,7 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
         raise DegenerateError(
             "RIL-375",
             f"{beyond:.0%} of the matches lie beyond infinity",
-            remedy="check that left and right are of one scene and one time, the angles between the cameras, that each "
-            "has its own principal point, and whether the scene repeats along the rows (rows of plants, bricks, tiles)",
+            remedy="check that left and right are of one scene and one time, the angles between the cameras (is R "
+            "transposed?), that each has its own principal point, and whether the scene repeats along the rows (rows "
+            "of plants, bricks, tiles)",
         )

@@ -54,8 +54,8 @@ SCENE = "scene"
 
 HANGING = (
     "what looks like ground lies above the cameras: are the images of both mirrored top to bottom, which mirrors the "
-    "world, or upside down (then turn them by 180 degrees and exchange left and right, or state world.up), or is it a "
-    "ceiling?"
+    "world, or upside down (then turn them by 180 degrees and exchange left and right, or state world.up), has a "
+    "stated vertical the wrong sign, or is it a ceiling?"
 )
 
 UPRIGHT = np.array([0.0, -1.0, 0.0])

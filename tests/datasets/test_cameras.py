@@ -679,6 +679,8 @@ def test_middlebury_is_in_millimetres(tmp_path):
         (CAMODOCAL.format(kind="MEI", mirror="mirror_parameters: {xi: 1.9}\n", projection=USUAL), ("RIL-814", "MEI")),
         (CAMODOCAL.format(kind="SCARAMUZZA", mirror="", projection=USUAL), ("RIL-814", "SCARAMUZZA")),
         ("sensor_type: imu\nrate_hz: 200\n", ("RIL-100",)),
+        ('{"CameraParameters1":{"RadialDistortion":[0,0]},"TranslationOfCamera2":[-97,0,0]}', ("RIL-101", "MATLAB")),
+        ("<?xml version='1.0'?><calibration>\n <projection>frame</projection></calibration>", ("RIL-101", "Metashape")),
         ("", ("RIL-100",)),
         ("just words\n", ("RIL-100",)),
         ("<?xml version='1.0'?>\n<opencv_storage><imagelist>\"a.jpg\"</imagelist></opencv_storage>", ("RIL-100",)),

@@ -531,6 +531,11 @@ def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
     ("text", "lines", "expected"),
     [
         ('[truth]\nfile = "p.txt"\n', ["1 0 0 0 0 1 0 0 0 0 1 0"], ("RIL-230",)),
+        (
+            '[truth]\nfile = "p.txt"\n',
+            ["frame time,qw,qx,qy,qz", "7,1,0,0,0"],
+            ("RIL-230", "frame time", "is called time"),
+        ),
         ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti")),
         ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-138", "nothing.txt")),
     ],
@@ -585,6 +590,14 @@ def test_a_baseline_of_two_stations_far_apart_is_read_where_its_unit_is_stated(t
     with raises("RIL-244", "0.097 or 0.97", "rig.unit = 1"):
         opened(write_sequence(tmp_path, rig=rig))
     assert opened(write_sequence(tmp_path, rig=rig + "unit = 1\n")).rig.baseline == pytest.approx(97.0)
+
+
+@pytest.mark.parametrize(("file", "unit", "doubted"), [(3.9, "", True), (3.9, "unit = 1\n", False), (0.5, "", False)])
+def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, file, unit, doubted):
+    rows = f"100 0 31.5 0 0 100 23.5 0 0 0 1 0\n100 0 31.5 {-100 * file} 0 100 23.5 0 0 0 1 0\n"
+    (tmp_path / "calib.txt").write_text(rows)
+    sequence = opened(write_sequence(tmp_path, cameras='[cameras]\nfile = "calib.txt"\n', rig=f"[rig]\n{unit}"))
+    assert [line for line in sequence.warnings if "square of the chessboard" in line] == [*sequence.warnings][:doubted]
 
 
 # -- bad input, one line each ------------------------------------------------------------------------------------------

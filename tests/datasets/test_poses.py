@@ -36,11 +36,12 @@ def read(tmp_path, text, **kwargs):
             f"1,1,2,3,{H},0,0,{H}\n2,1,2,3,1,0,0,0\n",
             "auto",
         ),
+        (f"frame,time,tx,ty,tz,rx,ry,rz,rw\n0,1,1,2,3,0,0,{H},{H}\n1,2,1,2,3,0,0,0,1\n", "auto"),
         (f"qx,qy,qz,qw,z,y,x,time\n0,0,{H},{H},3,2,1,1\n0,0,0,1,3,2,1,2\n", "csv"),
         (f"1 1 2 3 {H} 0 0 {H}\n2 1 2 3 1 0 0 0\n", "euroc"),
         (f"1,1,2,3,0,0,{H},{H}\n2,1,2,3,0,0,0,1\n", "tum"),
     ],
-    ids=["tum", "tum named", "euroc", "euroc named", "vicon", "csv in any order", "as euroc", "as tum"],
+    ids=["tum", "tum named", "euroc", "euroc named", "vicon", "r", "csv in any order", "as euroc", "as tum"],
 )
 def test_forms_of_one_pose(tmp_path, text, format):
     found = read(tmp_path, text, format=format)
@@ -89,6 +90,22 @@ def test_names_in_a_bracket_that_commas_part_tell_the_order_of_a_quaternion(tmp_
     found = read(tmp_path, names + f"5,1,2,3,0,0,{H},{H},1\n")
     assert found.times == (5.0,)
     np.testing.assert_allclose(found.poses[0].matrix34, np.column_stack([TURN, [1, 2, 3]]), atol=1e-12)
+
+
+def test_coordinates_that_were_rounded_to_single_precision_are_named_with_their_step(tmp_path):
+    way = np.array([431000.0, 5411000.0, 300.0]) + np.arange(8)[:, None] * [0.71, 0.83, 0.01]
+
+    def table(places):
+        (tmp_path / "p.csv").write_text(
+            "\n".join(["time,x,y,z", *(f"{k},{x},{y},{z}" for k, (x, y, z) in enumerate(places))])
+        )
+        return read_motion(tmp_path / "p.csv")
+
+    [line] = positions_of(table(way.astype(np.float32)), "auto", {}).warnings
+    assert "steps of 0.5 m" in line
+    assert positions_of(table(way.round(2)), "auto", {}).warnings == ()
+    near = (way - way[0]).astype(np.float32)
+    assert positions_of(table(near), "auto", {}).warnings == ()
 
 
 @pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)])

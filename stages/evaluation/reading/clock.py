@@ -110,10 +110,11 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
     # The search takes differences, which infinity has none of.
     near = scipy.optimize.minimize_scalar(lambda x: min(error(x), 1e3), bounds=span, method="bounded", options=options)
     value = value if errors.min() <= near.fun else float(near.x)
-    worse = np.flatnonzero(errors > EQUAL_ERROR * error(value))
-    above = int(np.searchsorted(tried[worse], value))
-    # The nearest worse offset to either side; without one, and where too few frames are compared, no end was reached.
-    ends = [worse[above - 1] if above > 0 else 0, worse[above] if above < len(worse) else -1]
+    equal = np.append(tried[errors <= EQUAL_ERROR * error(value)], value)
+    # The nearest worse offsets beyond all that are as good: where straight lines join the rows of the truth, offsets
+    # between its rows fit worse than those of whole rows. Too few frames compared are no end.
+    beyond = np.searchsorted(tried, equal.min()) - 1, np.searchsorted(tried, equal.max(), side="right")
+    ends = np.clip(beyond, 0, len(tried) - 1)
     ended = [bool(EQUAL_ERROR * error(value) < errors[k] < np.inf) for k in ends]
     low, high = (float(tried[k]) for k in ends)
     # 0.5: share of the searched range: where equally good offsets span more, the offset is not determined.

@@ -9,7 +9,7 @@ trajectory. A drive that is straight or hardly turns is fitted by several readin
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import accumulate, product
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ import scipy
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.imu_check import signed_axes
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
-from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread
+from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread, standing_out
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
@@ -60,7 +60,9 @@ class ReadingFit(NamedTuple):
     words: str
 
 
-def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform, sigma: float) -> list[str]:
+def better_reading(
+    estimate: Floats, truth: Floats, T_body_left: RigidTransform, sigma: float, mounted: Floats | None = None
+) -> list[str]:
     """Warn of conventions by which the truth fits far better than as it was read, and say what to do about the file.
 
     Parameters
@@ -69,6 +71,7 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     truth : (frame, 3, 4) T_truth_left as read.
     T_body_left : by which the file's poses were multiplied.
     sigma : m, of the estimated positions.
+    mounted : (frame, 3, 4) truth of a body that is mounted otherwise (:mod:`.hand_eye`), which needs no word here.
     """
     chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
     P, Q, mount = estimate[chosen], truth[chosen], T_body_left.matrix34
@@ -77,16 +80,15 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
         return []
     if spread(Q) < 1e-6 * spread(P):
         return [f"the truth rests, the trajectory extends {spread(P):.3g} m: is it the right file, and does it go on?"]
-    moved, said = (np.linalg.norm(np.diff(T[:, :, 3], axis=0), axis=1) for T in (estimate, truth))
-    # 20 times the longest step of the estimate is a jump.
-    jumps = np.flatnonzero(said > 20.0 * moved.max())
-    if 0 < len(jumps) < len(said) / 3:
-        at, much = jumps[0], f"by {said[jumps[0]]:.3g} m behind {jumps[0] + 1} of its {len(truth)} poses"
-        return [f"the truth jumps {much}, the trajectory moves by {moved[at]:.3g} m there: correct or remove that pose"]
     as_read, file = _misfit(P, Q), compose(Q, inverse(mount))
-    if as_read < MIN_MISFIT:
-        return []
-    fits = _fits(P, Q[::-1], mount, ["it runs backwards: reverse its rows, or the order of the images"])
+    jumps = _jumps(estimate, truth, sigma)
+    if jumps or as_read < MIN_MISFIT:
+        return jumps
+    fits = [] if mounted is None else [ReadingFit(_misfit(P, mounted[chosen]), 2, "")]
+    if not np.allclose(mount, np.eye(3, 4)):
+        turned = compose(file, inverse(mount))
+        fits.append(ReadingFit(_misfit(P, turned), 0, "truth.T_body_left leads from the body to the camera: invert it"))
+    fits += _fits(P, Q[::-1], mount, ["it runs backwards: reverse its rows, or the order of the images"])
     for order, direction, mirror in product(ORDERS, DIRECTIONS, MIRRORS):
         # A file that begins with the identity has its quaternions in the right order.
         if not (order and angle(file[0]) < MIN_TURN):
@@ -113,10 +115,30 @@ def better_reading(estimate: Floats, truth: Floats, T_body_left: RigidTransform,
     simple = sorted(fit for fit in fits if fit.changes == changes)
     simple = [fit for fit in simple if fit.misfit <= ALIKE_FACTOR * simple[0].misfit + ALIKE_SHARE]
     told = list(dict.fromkeys(fit.words for fit in simple))
+    if "" in told:
+        return []
     return [
         f"the truth fits the trajectory far better by another convention ({100 * best:.2g} % of its extent are left, "
         f"{100 * as_read:.3g} % as read): {'; or: '.join(told)}"
         + ("; this drive cannot tell these apart" if len(told) > 1 else "")
+    ]
+
+
+def _jumps(P: Floats, Q: Floats, sigma: float) -> list[str]:
+    """Warn of few motions of the truth Q (n, 3, 4) that depart from those of P far more than the others do, and without
+    which it fits; ``sigma``, m, of a position of P."""
+    moved, said = (compose(inverse(T[:-1]), T[1:]) for T in (P, Q))
+    off = np.linalg.norm(moved[:, :, 3] - said[:, :, 3], axis=1)
+    jumps = np.flatnonzero(standing_out(off, 3.0 * sigma))
+    said[jumps] = moved[jumps]
+    steady = np.array(list(accumulate(said, compose, initial=Q[0])))
+    if not len(jumps) or _misfit(P, steady) > MAX_SHARE * _misfit(P, Q):
+        return []
+    text = (
+        f"behind {jumps[0] + 1} of its {len(Q)} poses, usually by {np.median(off):.2g} m: correct or remove poses there"
+    )
+    return [
+        f"the truth jumps by {off[jumps[0]]:.3g} m against the trajectory {text}, unless it is the trajectory's error"
     ]
 
 
@@ -125,6 +147,8 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
     ratio, fits = spread(P) / max(spread(Q), 1e-12), []
     if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
         unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
+        if words and unit not in UNITS:
+            return []  # two mistakes of which one has any size explain too much
         doubt = "" if unit in UNITS else ", unless its clock runs otherwise, or the rig's baseline is wrong"
         words = [*words, f"its unit of length is {unit:g} m: state truth.unit = {unit:g}{doubt}"]
         Q = Q * [1.0, 1.0, 1.0, unit]

@@ -95,7 +95,7 @@ def misplaced(off: Floats, body: RigidTransform, given: Mapping[str, Metric], wi
 
     stated = rigid.compose(body.matrix34, off).round(4) + 0.0
     return (
-        f"the truth's body is turned by {math.degrees(float(rigid.angle(off))):.2g} degrees and shifted by "
+        f"the truth's body is turned by {math.degrees(float(rigid.angle(off))):.3g} degrees and shifted by "
         f"{np.linalg.norm(off[:, 3]):.2g} m against what T_body_left says: errors from frame to frame are "
         f"{pair('rpe_translation_rmse')}, after the best fit {pair('ate_rmse')}: check how it is mounted (a principal "
         f"point that is off looks like a turn), or state truth.T_body_left = {stated.tolist()}"

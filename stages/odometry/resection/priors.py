@@ -33,7 +33,8 @@ from rille.stages.odometry.resection.sensors import (
 MIN_LEAN = math.radians(0.05)
 """Of the world against the vertical that is not worth a word: 1 mm a metre."""
 REMEDY = {
-    "odometry": "correct T_body_left, unit or time_offset, or raise drift and turn_deg",
+    "odometry": "correct T_body_left, unit, time_offset, the quaternions' order or the poses' direction (body to "
+    "world), or raise drift and turn_deg",
     "attitude": "correct T_body_left (T_imu_left), the order of its columns or time_offset, or raise sigma_deg",
     "positions": "correct columns, unit, lever_arm or time_offset, or raise sigma",
     "up": "correct T_body_left (T_imu_left), the order of its columns or up, or raise sigma_deg",

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
-from rille.stages.geometry.rigid import compose, motion, posed, umeyama
+from rille.stages.geometry.rigid import compose, motion, posed, standing_out, umeyama
 from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
@@ -106,6 +106,9 @@ def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
 
 def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[float, str]:
     """By which share vectors (m, 3) of a sensor depart from the camera's; how, where it is more than allowed."""
+    # The adjustment leaves out single ones that stand out, as of a jump.
+    usual = ~standing_out(np.linalg.norm(own - said, axis=1))
+    own, said = own[usual], said[usual]
     size = math.sqrt(float((own**2).sum()))
     off = math.sqrt(float(((own - said) ** 2).sum())) / max(size, 1e-12)
     if off <= allowed:
@@ -128,7 +131,7 @@ def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[flo
         # Metres of a degree of latitude and, as far north as people drive, of longitude
         unit = " (degrees are no metres)" if 3e4 < scale < 1.2e5 else ""
         reads.append(f"its lengths have to be multiplied by {scale:.3g}{unit}, or the rig's baseline divided")
-    fits = f"; {' and '.join(reads)}, which leaves {left:.1%}" if reads and left < 0.5 * off else ""
+    fits = f"; {' and '.join(reads)}, which leaves {left:.1%}" if reads and left < min(0.5 * off, allowed) else ""
     return off, f"its {what} depart from the camera's by {off:.1%}, where {allowed:.1%} is possible{fits}"
 
 
@@ -295,7 +298,13 @@ class PositionPrior:
             way = (fixes.antenna[mine] - fixes.antenna[mine].mean(0)) * [1.0, 1.0, 0.0]
             said = fit_plane(fixes.positions[mine], way).apply(fixes.positions[mine]) * [1.0, 1.0, 0.0]
             share = float(np.hypot(*self.sigma[:2])) / math.sqrt(float((way**2).sum(1).mean()))
-            found.append(departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways"))
+            off, why = departure(way, said, CAMERA_SHARE + MIN_SIGMAS * share, "ways")
+            steps = np.linalg.norm(np.diff(way - said, axis=0), axis=1)
+            if why and standing_out(steps).any():
+                at = int(steps.argmax())
+                x, y = fixes.positions[mine][at, :2]
+                why += f"; they jump by {steps[at]:.2g} m behind ({x:.2f}, {y:.2f})"
+            found.append((off, why))
         return max(found, key=lambda one: (bool(one[1]), one[0]), default=(math.inf, ""))
 
     def factors(self, own: OwnTrajectory, late: float) -> Factors:

@@ -16,11 +16,11 @@ RADTAN, FISHEYE = (-0.28, 0.07, 0.0002, 0.00002), (0.004, -0.002, 0.002, 0.0005)
 FIVE = (-0.35, 0.18, 0.0005, -0.0003, -0.06)
 
 
-def pairs(true: Lens, given: Lens) -> list[PointPairs]:
+def pairs(true: Lens, given: Lens, rig: Rig = RIG) -> list[PointPairs]:
     """Matches of images that one lens took, undistorted by another; with noise, and a tenth of them mismatched."""
     rng = np.random.default_rng(5)
     points = CAMERA.rays(rng.uniform((20, 20), (730, 460), (900, 2))) * rng.uniform(1.0, 4.0, (900, 1))
-    ideal = RIG.left.project(points), RIG.right.project(RIG.T_right_left.apply(points))
+    ideal = RIG.left.project(points), rig.right.project(rig.T_right_left.apply(points))
     left, right = (given.undistort(true.distort(p, CAMERA) + rng.normal(0, 0.1, p.shape), CAMERA) for p in ideal)
     right[::10] += rng.uniform(-30, 30, right[::10].shape)
     seen = np.isfinite(left).all(1) & np.isfinite(right).all(1)
@@ -52,3 +52,14 @@ def test_a_turned_camera_is_no_other_reading() -> None:
         CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, 0.0, 0.01]) @ RIG.T_right_left.rotation, [-0.11, 0, 0])
     )
     assert not better_reading(knocked, {"left": lens, "right": lens}, pairs(lens, lens))
+
+
+@pytest.mark.parametrize("lens", [Lens(CAMERA, "radtan", RADTAN), Lens(CAMERA)], ids=["distorted", "ideal"])
+def test_a_rotation_between_the_cameras_that_is_transposed_is_named(lens: Lens) -> None:
+    turned = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, -0.02, 0.015]), RIG.T_right_left.translation))
+    transposed = Rig(CAMERA, CAMERA, RigidTransform(turned.T_right_left.rotation.T, turned.T_right_left.translation))
+    matches = pairs(lens, lens, turned)
+    said = better_reading(transposed, {"left": lens, "right": lens}, matches)
+    assert said.startswith("R between the cameras seems misread")
+    assert said.endswith("if it is transposed")
+    assert not better_reading(turned, {"left": lens, "right": lens}, matches)

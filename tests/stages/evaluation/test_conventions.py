@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rille.stages.core.arrays import Floats
 from rille.stages.evaluation.reading.conventions import better_reading
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.rigid import compose
 
 NED = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Camera axes (x right, y down, z ahead) in those of a vehicle: x ahead, y right, z down."""
@@ -153,8 +154,26 @@ def test_a_jump_is_named_as_one_and_not_taken_for_a_unit():
     wrong = true.copy()
     wrong[9, :, 3] = [1e6, 0.0, 0.0]
     (line,) = better_reading(estimated(true, 1), wrong, RigidTransform.identity(), 0.01)
-    assert "jumps by 1e+06 m behind 9 of its 24 poses" in line
+    assert "jumps by 1e+06 m against the trajectory behind 9 of its 24 poses" in line
     assert "unit" not in line
+
+
+@pytest.mark.parametrize("much", [0.1, 0.4, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_jump_from_which_on_truth_stays_off_is_named(much: float, seed: int) -> None:
+    true = drive(seed)
+    wrong = true.copy()
+    wrong[9:, :, 3] += [0.0, much, 0.0]
+    (line,) = better_reading(true, wrong, RigidTransform.identity(), 0.01)
+    assert f"jumps by {much:g} m against the trajectory behind 9 of its 24 poses" in line
+
+
+def test_a_mount_that_is_inverted_is_named_as_that() -> None:
+    for seed in range(3):
+        true, mount = drive(seed, turn=1.0), RigidTransform(NED, np.array([0.3, 0.05, -0.2]))
+        wrong = compose(compose(true, mount.inverse().matrix34), mount.inverse().matrix34)
+        (line,) = better_reading(estimated(true, seed), wrong, mount.inverse(), 0.01)
+        assert line.endswith("as read): truth.T_body_left leads from the body to the camera: invert it")
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -56,7 +56,7 @@ def truth(width: int, offset: float, turn: float = 2.0, start: float = -2.0, end
 @pytest.mark.parametrize("width", [2, 3])
 @pytest.mark.parametrize("offset", [0.7, -1.33, 1.4e9])
 def test_offset_and_turn_are_found(width, offset):
-    moved, metrics, warnings = position_accuracy(cameras(at(MOMENTS)), truth(width, offset), MOMENTS)
+    moved, metrics, warnings, _ = position_accuracy(cameras(at(MOMENTS)), truth(width, offset), MOMENTS)
     assert metrics["time_offset"]["value"] == pytest.approx(offset, abs=2e-3)
     assert metrics["position_rmse"]["value"] < 0.01  # chords of rows .05 s apart
     assert metrics["frames_judged"]["value"] == len(MOMENTS)
@@ -67,7 +67,7 @@ def test_offset_and_turn_are_found(width, offset):
 def test_noise_widens_the_range_of_the_offset_and_is_the_error():
     rng = np.random.default_rng(3)
     noisy = at(MOMENTS) + rng.normal(scale=0.2, size=(len(MOMENTS), 3))
-    _, metrics, _ = position_accuracy(cameras(noisy), truth(2, 0.7), MOMENTS)
+    _, metrics, _, _ = position_accuracy(cameras(noisy), truth(2, 0.7), MOMENTS)
     # two axes of .2 m; the fit takes 4 of 160 degrees of freedom
     assert metrics["position_rmse"]["value"] == pytest.approx(0.2 * np.sqrt(2), rel=0.15)
     assert metrics["time_offset"]["value"] == pytest.approx(0.7, abs=0.1)
@@ -75,7 +75,7 @@ def test_noise_widens_the_range_of_the_offset_and_is_the_error():
 
 
 def test_an_error_of_scale_stays_an_error():
-    _, metrics, _ = position_accuracy(cameras(1.05 * at(MOMENTS)), truth(2, 0.7), MOMENTS)
+    _, metrics, _, _ = position_accuracy(cameras(1.05 * at(MOMENTS)), truth(2, 0.7), MOMENTS)
     assert metrics["position_rmse"]["value"] > 0.3
     assert metrics["position_drift"]["value"] == pytest.approx(5.0, rel=0.2)
 
@@ -85,7 +85,7 @@ def test_a_straight_line_at_constant_speed_determines_no_offset():
     moments = np.arange(-5.0, 15.0, 0.1)
     known = TruePositions(np.stack([8.0 * moments, 0 * moments], axis=1), moments, 0.2)
     noisy = line + np.random.default_rng(0).normal(scale=0.01, size=line.shape)
-    _, metrics, warnings = position_accuracy(cameras(noisy), known, MOMENTS)
+    _, metrics, warnings, _ = position_accuracy(cameras(noisy), known, MOMENTS)
     assert metrics["time_offset"]["value"] == 0.0
     (warning,) = warnings
     assert "not determined" in warning
@@ -95,7 +95,7 @@ def test_rows_are_frames_where_there_are_no_times():
     places = elsewhere(at(MOMENTS), 1.0)[:, :2]
     estimate = at(MOMENTS)
     estimate[5] = np.nan
-    moved, metrics, _ = position_accuracy(cameras(estimate), TruePositions(places))
+    moved, metrics, _, _ = position_accuracy(cameras(estimate), TruePositions(places))
     assert metrics["frames_judged"]["value"] == len(MOMENTS) - 1
     assert metrics["position_max"]["value"] < 1e-6
     assert "time_offset" not in metrics
@@ -104,14 +104,14 @@ def test_rows_are_frames_where_there_are_no_times():
 
 def test_mirrored_axes_are_said():
     places = elsewhere(at(MOMENTS), 1.0)[:, [1, 0]]
-    _, _, warnings = position_accuracy(cameras(at(MOMENTS)), TruePositions(places))
+    _, _, warnings, _ = position_accuracy(cameras(at(MOMENTS)), TruePositions(places))
     (warning,) = warnings
     assert "mirrored" in warning
 
 
 def test_axes_of_a_camera_are_said():
     right, ahead, up = elsewhere(at(MOMENTS), 1.0).T
-    _, _, warnings = position_accuracy(cameras(at(MOMENTS)), TruePositions(np.stack([right, -up, ahead], axis=1)))
+    _, _, warnings, _ = position_accuracy(cameras(at(MOMENTS)), TruePositions(np.stack([right, -up, ahead], axis=1)))
     (warning,) = warnings
     assert 'y = "z"' in warning
     assert position_accuracy(cameras(at(MOMENTS)), TruePositions(np.stack([right, ahead, up], axis=1)))[2] == []
@@ -141,7 +141,7 @@ def test_gaps_and_few_frames():
     few = np.full((len(MOMENTS), 3), np.nan)
     few[:3] = at(MOMENTS)[:3]
     assert find_offset(MOMENTS, few, known) is None
-    _, metrics, _ = position_accuracy(cameras(few), known, MOMENTS)
+    _, metrics, _, _ = position_accuracy(cameras(few), known, MOMENTS)
     assert metrics["position_rmse"]["value"] is None
     assert metrics["frames_judged"]["value"] == 3
 
@@ -166,7 +166,7 @@ def test_stage():
 def test_images_that_are_farther_apart_than_any_offset_that_is_searched(apart: float) -> None:
     moments = apart * np.arange(12)
     places = np.stack([0.01 * moments, np.sin(moments), np.zeros(12)], axis=1)
-    _, metrics, _ = position_accuracy(cameras(places), TruePositions(places[:, :2], moments, 2.0 * apart), moments)
+    _, metrics, _, _ = position_accuracy(cameras(places), TruePositions(places[:, :2], moments, 2.0 * apart), moments)
     assert metrics["position_rmse"]["value"] == pytest.approx(0.0, abs=1e-9)
 
 
@@ -191,8 +191,8 @@ def test_the_true_way_leads_on_where_poses_were_lost_and_straight_where_truth_is
 def test_truth_with_heights_is_fitted_in_space_where_the_vertical_was_not_measured():
     """The world is that of a camera which looks down by 20 degrees."""
     tilted = at(MOMENTS) @ Rotation.from_euler("x", 20, degrees=True).as_matrix().T
-    _, level, _ = position_accuracy(cameras(tilted), truth(3, 0.7), MOMENTS)
-    _, metrics, warnings = position_accuracy(cameras(tilted), truth(3, 0.7), MOMENTS, upright=False)
+    _, level, _, _ = position_accuracy(cameras(tilted), truth(3, 0.7), MOMENTS)
+    _, metrics, warnings, _ = position_accuracy(cameras(tilted), truth(3, 0.7), MOMENTS, upright=False)
     assert level["position_rmse"]["value"] > 0.5
     assert metrics["position_rmse"]["value"] < 0.01
     assert "in space" in metrics["position_rmse"]["how"]
@@ -200,7 +200,7 @@ def test_truth_with_heights_is_fitted_in_space_where_the_vertical_was_not_measur
 
 
 def test_positions_in_millimetres_are_said():
-    _, _, warnings = position_accuracy(cameras(at(MOMENTS)), TruePositions(1e3 * at(MOMENTS)))
+    _, _, warnings, _ = position_accuracy(cameras(at(MOMENTS)), TruePositions(1e3 * at(MOMENTS)))
     assert ["truth.unit = 0.001" in line for line in warnings] == [True]
 
 
@@ -219,7 +219,7 @@ def test_a_lever_arm_is_fitted_where_turns_show_it_and_said(offset):
     R, antenna = mounted(0.6)
     rows = TruePositions(elsewhere(antenna, 1.0), MOMENTS - offset, 0.2)
     without = position_accuracy(cameras(at(MOMENTS)), rows, MOMENTS)[1]
-    moved, metrics, warnings = position_accuracy(cameras(at(MOMENTS), R), rows, MOMENTS)
+    moved, metrics, warnings, _ = position_accuracy(cameras(at(MOMENTS), R), rows, MOMENTS)
     assert without["position_rmse"]["value"] > 0.05
     assert metrics["position_rmse"]["value"] < 0.003
     assert moved == pytest.approx(at(MOMENTS), abs=0.01)  # the camera's places, not the antenna's
@@ -246,21 +246,51 @@ def test_an_arm_ahead_is_told_from_a_clock():
 def test_a_stated_lever_arm_is_used_and_none_is_fitted_without_turns_or_to_what_is_no_lever_arm():
     R, antenna = mounted(0.6)
     rows = TruePositions(elsewhere(antenna, 1.0), lever_arm=LEVER)
-    _, metrics, warnings = position_accuracy(cameras(at(MOMENTS), R), rows)
+    _, metrics, warnings, _ = position_accuracy(cameras(at(MOMENTS), R), rows)
     assert metrics["position_rmse"]["value"] < 1e-6
     assert warnings == []
     # An antenna on a camera that hardly turns is displaced, which the fit takes; a scale error is not an arm.
     for swing, scale in ((0.02, 1.0), (0.6, 1.05)):
         R, antenna = mounted(swing)
         places = TruePositions(elsewhere(antenna if scale == 1.0 else scale * at(MOMENTS), 1.0))
-        _, metrics, warnings = position_accuracy(cameras(at(MOMENTS), R), places)
+        _, metrics, warnings, _ = position_accuracy(cameras(at(MOMENTS), R), places)
         assert warnings == []
         assert metrics["position_rmse"]["value"] > 1e-3
 
 
 def test_the_part_of_a_lever_arm_along_the_axis_of_all_turns_is_not_told():
     R = Rotation.from_euler("z", np.sin(MOMENTS)[:, None]).as_matrix() @ [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
-    _, metrics, (line,) = position_accuracy(cameras(at(MOMENTS), R), TruePositions(at(MOMENTS) + R @ LEVER))
+    _, metrics, (line,), _ = position_accuracy(cameras(at(MOMENTS), R), TruePositions(at(MOMENTS) + R @ LEVER))
     assert metrics["position_rmse"]["value"] < 1e-6
     assert "[0.1, 0, 0.08]" in line
     assert "along the axis of its turns" in line
+
+
+@pytest.mark.parametrize("width", [2, 3])
+@pytest.mark.parametrize("rows", [slice(30, None), slice(30, 31)], ids=["from there on", "one"])
+def test_a_jump_is_named_with_its_row(width, rows):
+    places = elsewhere(at(MOMENTS), 1.0)[:, :width]
+    places[rows, 0] += 6.0
+    noisy = at(MOMENTS) + 0.01 * np.random.default_rng(0).standard_normal((80, 3))
+    [line] = position_accuracy(cameras(noisy), TruePositions(places)).warnings
+    assert line.startswith("true positions jump by ")
+    assert "behind 30 of 80 of them" in line
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_degrees_are_named_and_are_no_lever_arm(turned):
+    # Seen from a point within, the turning camera stays where it is, but for degrees of less than a metre.
+    R = Rotation.from_euler("z", 0.1 * np.arange(80)[:, None]).as_matrix()
+    poses = cameras(R @ [2.0, 0.0, 0.0], R) if turned else cameras(at(MOMENTS))
+    degrees = [11.0, 48.0, 500.0] + poses[:, :, 3] / [75000.0, 111000.0, 1.0]
+    [line] = position_accuracy(poses, TruePositions(degrees)).warnings
+    assert "as degrees of latitude and longitude" in line
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_positions_of_another_drive_are_said_not_to_fit(seed):
+    other = np.cumsum(np.random.default_rng(seed).standard_normal((80, 3)), axis=0)
+    [line] = position_accuracy(cameras(at(MOMENTS)), TruePositions(5.0 * other)).warnings
+    assert "do not fit the trajectory" in line
+    noise = 0.5 * np.random.default_rng(seed).standard_normal((80, 3))
+    assert position_accuracy(cameras(at(MOMENTS)), TruePositions(at(MOMENTS) + noise)).warnings == []

@@ -169,6 +169,9 @@ def test_a_turn_that_is_stated_leads_ways_aside(stated, contradicts):
 def test_degrees_of_latitude_are_named():
     own = np.random.default_rng(1).normal(size=(9, 3))
     assert "degrees are no metres" in departure(own, own / 1.11e5, 0.1, "ways")[1]
+    # Nor is anything said to explain what it leaves nearly as it was.
+    assert "leaves" not in departure(own, np.roll(own, 1, axis=0), 0.1, "ways")[1]
+    assert "leaves" not in departure(own, -own + 0.4 * np.roll(own, 1, axis=0), 0.1, "ways")[1]
 
 
 def test_too_few_positions_contradict_nothing():
@@ -198,6 +201,31 @@ def test_positions_that_are_off_for_a_while_are_left_out():
     out = adjusted(segments, before, gnss(truth, rng, sigma=0.1, jump=2.0))
     assert out.meta["priors"]["positions"]["left_out"] == 6
     assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("jump", [3.0, 300.0])
+def test_odometry_that_jumps_once_goes_on_behind_it(jump):
+    truth, rng = winding(), np.random.default_rng(5)
+    segments, before = run_of(truth, rng)
+    given = odometry(truth, rng)
+    for pose in given["odometry"]["poses"][15:]:
+        pose[3] += jump
+    out = adjusted(segments, before, given)
+    assert out.meta["priors"]["odometry"]["used"]
+    assert out.meta["priors"]["odometry"]["left_out"] in (1, 2)
+    assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.5
+
+
+def test_positions_that_jump_and_stay_there_are_refused_as_that():
+    truth, rng = winding(), np.random.default_rng(5)
+    segments, before = run_of(truth, rng)
+    given = gnss(truth, rng, sigma=0.02)
+    for place in given["positions"]["positions"][15:]:
+        place[1] += 8.0
+    (line,) = (line for line in adjusted(segments, before, given).meta["warnings"] if line.startswith("["))
+    assert "not used" in line
+    x, y, _ = given["positions"]["positions"][14]
+    assert f"they jump by 7.8 m behind ({x:.2f}, {y:.2f})" in line
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.03])
