@@ -64,11 +64,10 @@ def examined(sequence: Sequence) -> Sequence:
         # 0.2: in images of scenes that move at most 0.03, by a pattern of 8 grey levels in 256 0.25, of 25 0.7.
         if share > 0.2:
             text = (
-                f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract a"
+                f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract "
+                "a dark frame, the mean of images that are taken with the lens covered"
             )
-            lines.append(
-                warning("RIL-833", f"{text} dark frame, the mean of images that are taken with the lens covered")
-            )
+            lines.append(warning("RIL-833", text))
     chosen_levels = levels.levels_of(image for of in images.values() for image in of)
     if chosen_levels is None:
         return replace(sequence, warnings=(*sequence.warnings, *lines))
