@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
@@ -86,26 +84,25 @@ def rig_of(
 
 def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> None:
     """Refuse images of another scale than a calibration that states no size, as its principal points show."""
-    scales = list[float]()
-    for camera, (width, height) in zip(cameras, sizes, strict=True):
-        c = camera.lens.camera
-        if camera.size is not None or min(c.cx, c.cy) <= 0:
-            return
-        scales += [width / (2 * c.cx + 1), height / (2 * c.cy + 1)]
-    scale = float(np.median(scales))
-    # Where the four differ, images were cut, or principal points are off: neither can be told from the other.
-    if max(scales) > 1.1 * min(scales) or abs(0.5 / scale - 0.5) <= MAX_OFF_CENTRE:
+    both = tuple(camera.lens.camera for camera in cameras)
+    if any(camera.size is not None for camera in cameras) or min(min(c.cx, c.cy) for c in both) <= 0:
         return
-    c, (width, height) = cameras[0].lens.camera, sizes[0]
-    text = (
-        f"the principal points of both cameras are the centres of images of some {2 * c.cx + 1:.0f} x "
-        f"{2 * c.cy + 1:.0f} pixels, the images are {width} x {height}"
-    )
-    remedy = (
-        f"give the calibration of images of this size (fx, fy, cx and cy times {scale:.2g}); if it is theirs, state it "
-        "with width and height in a manifest"
-    )
-    raise InputError("RIL-974", text, remedy=remedy)
+    scales = [(width / (2 * c.cx + 1), height / (2 * c.cy + 1)) for c, (width, height) in zip(both, sizes, strict=True)]
+    # Where columns and rows differ, images were cut, or principal points are off: neither can be told from the other.
+    if any(max(one) > 1.1 * min(one) for one in scales):
+        return
+    for camera, c, one, (width, height) in zip(cameras, both, scales, sizes, strict=True):
+        scale = sum(one) / 2
+        if abs(0.5 / scale - 0.5) > MAX_OFF_CENTRE:
+            text = (
+                f"the principal point of camera {camera.name} is the centre of images of some {2 * c.cx + 1:.0f} x "
+                f"{2 * c.cy + 1:.0f} pixels, the images are {width} x {height}"
+            )
+            remedy = (
+                f"give the calibration of images of this size (fx, fy, cx and cy times {scale:.2g}); if it is theirs, "
+                "state it with width and height in a manifest"
+            )
+            raise InputError("RIL-974", text, remedy=remedy)
 
 
 def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import resource
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -44,6 +45,13 @@ LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
 """Samples a pixel, bits a sample and OpenCV's conversion to grey, by the encoding of ``sensor_msgs/msg/Image``."""
 
 
+MAX_UNPACKED_BYTES = 2 << 30
+"""Memory in which a bag is read, beside what the process has already: chunks and messages have some MB, but may unpack
+to any size, whatever they state."""
+
+_LIMITS = resource.getrlimit(resource.RLIMIT_AS)
+
+
 class Message(NamedTuple):
     """Where a message lies: ``path`` of the bag, ``topic``, and ``at``, the time when it was recorded, ns."""
 
@@ -59,8 +67,10 @@ def opened(path: Path) -> Iterator[Any]:
     Raises
     ------
     InputError
-        The package is not installed, or the bag cannot be read, now or while it is open.
+        The package is not installed, or the bag cannot be read or unpacks without bound, now or while it is open.
     """
+    import psutil
+
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -70,17 +80,25 @@ def opened(path: Path) -> Iterator[Any]:
     for file in path.iterdir() if path.is_dir() else (path,):
         if not file.is_dir():
             open_regular(file, "bag", sys.maxsize).close()
+    soft, hard = _LIMITS
+    most = psutil.Process().memory_info().vms + MAX_UNPACKED_BYTES
     try:
+        resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(soft, most), hard))
         # bags of ROS 2 before Iron hold no definitions of their messages
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except RilleError:
         raise
+    except MemoryError as error:
+        text = f"{path} cannot be read in {MAX_UNPACKED_BYTES / 2**30:g} GiB: a chunk or message of it unpacks to more"
+        raise InputError("RIL-939", text, remedy="no recorder does that: write it anew in chunks of some MB") from error
     except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
         reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         text = f"{path} cannot be read as a bag: {reason}"
         remedy = "copy it again; `mcap recover` or `rosbag reindex` mends a recording that broke off"
         raise InputError("RIL-941", text, remedy=remedy) from error
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, _LIMITS)
 
 
 def depth(message: Any, name: str) -> Header:

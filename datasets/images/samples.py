@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from warnings import catch_warnings
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -52,12 +53,21 @@ def examined(sequence: Sequence) -> Sequence:
     lines = _orientations(*orientations.values())
     for camera, of in images.items():
         files.refuse_swapped(of, f"the {camera} images")
-    for camera in [camera for camera, of in images.items() if of and mosaic(of[0])]:
+    mosaics = [camera for camera, of in images.items() if of and mosaic(of[0])]
+    for camera in mosaics:
         text = f"{camera} images are a mosaic of colours (Bayer): convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
         lines.append(warning("RIL-826", text))
     for camera in [camera for camera, of in images.items() if any(map(interlaced, of))]:
         text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
         lines.append(warning("RIL-832", text))
+    for camera, share in [(camera, fixed_pattern(of)) for camera, of in images.items() if camera not in mosaics]:
+        # 0.2: in images of scenes that move at most 0.03, by a pattern of 8 grey levels in 256 0.25, of 25 0.7.
+        if share > 0.2:
+            text = (
+                f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract "
+                "a dark frame, the mean of images that are taken with the lens covered"
+            )
+            lines.append(warning("RIL-833", text))
     chosen_levels = levels.levels_of(image for of in images.values() for image in of)
     if chosen_levels is None:
         return replace(sequence, warnings=(*sequence.warnings, *lines))
@@ -129,6 +139,31 @@ def interlaced(image: AnyArray) -> bool:
 
     grey = image.astype(np.float32)
     return min(grey.shape) > 2 * BLOCK and ratio(grey) < 0.9 * min(1.0, ratio(grey.T))
+
+
+def fixed_pattern(images: list[AnyArray]) -> float:
+    """Share of the finest detail that keeps its place in some images (row, col) of a camera, in the median block.
+
+    0 where coarser detail does so as well, as before a camera that stands.
+    The mean of n images keeps one n-th of the variance of a scene that moves, and all of a fixed pattern's.
+    """
+    if len(images) < 3 or len({image.shape for image in images}) > 1 or min(images[0].shape) < 4 * BLOCK:
+        return 0.0
+
+    def kept(factor: int) -> float:
+        """The share in images made smaller by a factor."""
+        size = images[0].shape[1] // factor, images[0].shape[0] // factor
+        small = [cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA) for image in images]
+        details = np.stack([np.asarray(image - cv2.blur(image, (5, 5))) for image in small])
+        blocks = size[0] // BLOCK, size[1] // BLOCK
+        mean, all_ = (
+            cv2.resize(square, blocks, interpolation=cv2.INTER_AREA)
+            for square in (details.mean(axis=0) ** 2, (details**2).mean(axis=0))
+        )
+        return float(np.median((len(images) * mean / np.maximum(all_, 1e-6) - 1) / (len(images) - 1)))
+
+    fine = kept(1)
+    return fine if kept(2) < 0.75 * fine else 0.0
 
 
 def _orientations(left: set[int], right: set[int]) -> list[str]:

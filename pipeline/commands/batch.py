@@ -72,6 +72,8 @@ def table(ended: Sequence[Ended], sequences: Sequence[str]) -> str:
 
 def _figures(folder: Path | None) -> tuple[str, str, str, str, str]:
     """Frames with a pose, drift, number of what is missing, and tasks that were computed and that were cached."""
+    from rille.pipeline.report.delivery import lacking
+
     if folder is None:
         return "", "", "", "", ""
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
@@ -79,4 +81,4 @@ def _figures(folder: Path | None) -> tuple[str, str, str, str, str]:
     frames = report["frames"]
     share = f"{100 * sum(frame['posed'] for frame in frames) / len(frames):.0f} %" if frames else ""
     computed, cached = (str(sum(one[what] for one in report["stages"].values())) for what in ("computed", "cached"))
-    return share, "" if drift is None else f"{drift:.3g} %", str(len(report["missing"])), computed, cached
+    return share, "" if drift is None else f"{drift:.3g} %", str(len(lacking(report["missing"]))), computed, cached

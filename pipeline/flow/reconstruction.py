@@ -150,11 +150,11 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     row = {frame: k for k, frame in enumerate(frames)}
     # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
     turn, since = 0, len(make.graph.nodes)
-    torn: set[int] | None = None
+    torn: dict[int, str] | None = None
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening, dict.fromkeys(torn or (), TORN))
+        found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
         if found.choice is None:
             return
         chain, chosen, basic = found.chain, found.choice.keyframes, found.choice.basic
@@ -169,7 +169,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         segments, moved = yield from unmoved(make, matched, segments)
         p.resections = [s.resection for s in segments]
         wanted = without(segments, chain, torn)
-        if wanted != (torn or set()):
+        if wanted != (torn or {}):
             torn = wanted
             make.again(since)
             continue
@@ -405,24 +405,37 @@ def simultaneous(
             return Simultaneous(chain, lost, choice)
 
 
-def without(segments: list[Segment], chain: list[int], tried: set[int] | None) -> set[int]:
-    """Frames to go on without: the first of those that show two motions, or the one before it, in which many landmarks
-    were lost; of those that were ``tried``, the ones behind which nearly all landmarks have one motion.
+def without(segments: list[Segment], chain: list[int], tried: dict[int, str] | None) -> dict[int, str]:
+    """Frames to go on without, and why; of those that were ``tried``, which are kept out.
 
-    Behind something that moves by itself they show two as well.
+    Left and right of a pair do not fit each other where a part of its disparities departs from the landmarks' (in few
+    pairs: many do so where matches are bad). Two motions are shown by the first of the frames whose landmarks show
+    them, or the one before it, in which many landmarks were lost; and by a basic pair that part of the landmarks
+    contradicts, those before it and its own. Behind something that moves by itself frames show two as well: such a
+    frame is kept out only where nearly all landmarks of the frame behind then have one motion.
     """
     # A plan may have no facts.
-    parts = [s.resection.ref.meta.get("per_frame", []) for s in segments if s.resection.ref is not None]
-    facts = {one["frame"]: one for part in parts for one in part[1:]}
+    metas = [s.resection.ref.meta for s in segments if s.resection.ref is not None]
+    parts = [meta["per_frame"] for meta in metas if meta.get("per_frame")]
     if tried is not None:
+        facts = {one["frame"]: one for part in parts for one in part[1:]}
         behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
         # 0.8: of its landmarks.
-        return {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
-    doubted = {f for f, one in facts.items() if "contradiction" in one}
+        one_motion = {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
+        return {f: why for f, why in tried.items() if why == ODD or f in one_motion}
+    odd = {meta["per_frame"][-1]["frame"] for meta in metas if "torn" in meta}
+    if 4 * len(odd) > len(parts) + 1:
+        odd.clear()
+    parts = [part for part in parts if part[0]["frame"] not in odd]
+    behind_key = [one for part in parts for one in part[1:]]
+    doubted = {one["frame"] for one in behind_key if "contradiction" in one}
     # 0.5: of the landmarks that the frame before shows.
     thin = {one["frame"] for part in parts for was, one in pairwise(part) if one["inliers"] < 0.5 * was["inliers"]}
     first = [(a, b) for a, b, _ in zip(chain, chain[1:], chain[2:], strict=False) if b in doubted and a not in doubted]
-    return {a if a in thin else b for a, b in first}
+    # 0.7: of the landmarks that were found: in sound images 0.9 agree, by night 0.7.
+    split = {one["frame"] for one in behind_key if one["inliers"] < 0.7 * one["landmarks"]}
+    pairs = [part[0]["frame"] for part in parts if {one["frame"] for one in part[:2]} <= split]
+    return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, ODD)
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:

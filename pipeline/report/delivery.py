@@ -26,12 +26,12 @@ Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
 
 HARMLESS = ("no path", "crosscheck")
-"""Kinds of what is missing that are answers, or lie outside of the reconstruction: the run is complete with them."""
+"""Kinds of what is listed as missing that are answers, or lie outside of the reconstruction."""
 
 
-def is_complete(missing: Items) -> bool:
-    """Whether what is missing leaves the reconstruction whole: answers and what lies outside of it."""
-    return all(m["kind"] in HARMLESS for m in missing)
+def lacking(missing: Items) -> Items:
+    """What leaves a run incomplete, of what its report lists as missing."""
+    return [item for item in missing if item["kind"] not in HARMLESS]
 
 
 def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:

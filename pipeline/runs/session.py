@@ -201,7 +201,7 @@ def perform(
 
 def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:
     """What a run came to, in its closing lines; ``missing`` as its report lists it."""
-    from rille.pipeline.report.delivery import is_complete, left_out
+    from rille.pipeline.report.delivery import lacking, left_out
 
     counts, lines, arrived = result.counts, [], True
     if opened.drive is not None:
@@ -209,18 +209,22 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
         lines.append(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
         arrived = outcome[0] == "goal"
     page = opened.folder / "report.html"
-    lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(missing)}")
+    # Answers, and what lies outside of the reconstruction, are no loss: the exit code says the same.
+    lost = lacking(missing)
+    lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}")
     if opened.view.part:
         lines.append(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
-    words = (": ".join(word for word in (item["what"], item["why"]) if word) for item in missing)
-    complaints = [f"rille: missing: {line}" for line in words]
+    complaints = [
+        ": ".join(word for word in ("rille", "missing" if item in lost else "note", item["what"], item["why"]) if word)
+        for item in missing
+    ]
     if not result.ok:
         ledger = opened.folder / LEDGER
         complaints.append(f"rille: {counts['failed']} failed, {counts['skipped']} left out; ledger: {ledger}")
     done = result.ok and arrived
     # A drive that ended early did not come to the tasks that would have read all parameters.
     idle = list(_idle(opened)) if done else []
-    whole = done and is_complete(missing) and not idle
+    whole = done and not lost and not idle
     return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
 
 
@@ -281,7 +285,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
 
 def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict[str, Any]:
     """Write everything that the run leaves; give what ``report.json`` holds."""
-    from rille.pipeline.report.delivery import is_complete
+    from rille.pipeline.report.delivery import lacking
     from rille.pipeline.runs import run_files
 
     # The folder may go while a run of hours is under way; writing would make one without its first files.
@@ -295,7 +299,7 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = late(opened.view, opened.drive, tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / LEDGER, total=total, holes=not is_complete(report["missing"]))
+    events.add_facts(opened.folder / LEDGER, total=total, holes=bool(lacking(report["missing"])))
     return report
 
 

@@ -53,7 +53,7 @@ from rille.stages.geometry.epipolar import (
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
-from rille.stages.geometry.sides import refuse_impossible
+from rille.stages.geometry.sides import refuse_impossible, refuse_mirrored
 from rille.stages.numeric.robust import mad_sigma
 
 
@@ -128,9 +128,12 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
+    left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
     if (share > BEYOND_SHARE or far) and not turned:
-        left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
         refuse_impossible(rig, left, right, share)
+    elif applied:
+        # What mirrored images ask for may look like a knock.
+        refuse_mirrored(given, left, right)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))

@@ -67,7 +67,8 @@ class ResectFacts(Facts):
     adjusted jointly, says of errors of the calibration (``information``, ``pull``, ``turn_deg``; ``yaw`` and
     ``read_out``: information and pull of the rig's, and of the time that passes between the first and the last row),
     and the ``bias_px`` of its disparities; empty where nothing was adjusted.
-    ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end.
+    ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end. ``torn``: share of
+    that pair's disparities that depart otherwise than the others.
     """
 
     per_frame: list[dict[str, Any]]
@@ -75,6 +76,7 @@ class ResectFacts(Facts):
     contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]
+    torn: NotRequired[float]
 
 
 class IntrinsicsFacts(Facts):

@@ -33,18 +33,24 @@ def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float
     return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
 
 
+def refuse_mirrored(rig: Rig, left: Floats, right: Floats) -> None:
+    """Refuse matches that fit the rig only once the images of both cameras are mirrored top to bottom.
+
+    Nothing shows it where baseline and axes lie in one plane.
+    """
+    back = [points * [1.0, -1.0] + [0.0, of.height - 1.0] for of, points in ((rig.left, left), (rig.right, right))]
+    if max(exchanged(rig, left, right)[1:]) < 0.4 and fits(rig, back[0], back[1]) > 0.8:
+        text = "the matches fit the rig only once the images of both cameras are mirrored top to bottom"
+        raise DegenerateError("RIL-684", text, remedy="mirror them back")
+
+
 def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
     """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig mirrored or with its sides swapped.
 
-    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines. Images of both
-    that are mirrored top to bottom show on lines, too, unless baseline and axes lie in one plane.
+    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines.
     """
+    refuse_mirrored(rig, left, right)
     swapped, as_given, other_way = exchanged(rig, left, right)
-    both = (rig.left, left), (rig.right, right)
-    back = [points * [1.0, -1.0] + [0.0, camera.height - 1.0] for camera, points in both]
-    if max(as_given, other_way) < 0.4 and fits(rig, back[0], back[1]) > 0.8:
-        text = "the matches fit the rig only once the images of both cameras are mirrored top to bottom"
-        raise DegenerateError("RIL-684", text, remedy="mirror them back")
     if swapped:
         raise DegenerateError(
             "RIL-781",

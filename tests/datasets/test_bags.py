@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sys
 from importlib import import_module
 
@@ -10,13 +11,14 @@ import numpy as np
 import pytest
 from raising import raises
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import rille
 from rille.datasets.bags import is_bag
+from rille.datasets.images import bag as bag_images
 from rille.datasets.registry import open_sequence
 from rille.pipeline.cli import main
 from rille.stages.core.declare import declared
@@ -86,6 +88,8 @@ class Bag:
         path = folder / ("drive.bag" if self.form == "bag" else "drive")
         plugin = StoragePlugin.SQLITE3 if self.form == "sqlite" else StoragePlugin.MCAP
         writer = Writer1(path) if self.form == "bag" else Writer2(path, version=9, storage_plugin=plugin)
+        if self.form == "packed":
+            writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
         with writer:
             topics = {}
             for topic, stamp, message in self.rows:
@@ -122,6 +126,18 @@ def run(source):
 
 def pixels(sequence, frame, camera):
     return np.asarray(run(sequence.image(frame, camera))["image"])
+
+
+def test_a_bag_that_unpacks_without_bound_is_refused(tmp_path, monkeypatch):
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    monkeypatch.setattr(bag_images, "MAX_UNPACKED_BYTES", 1 << 28)
+    bag = street("packed")
+    bag.image(LEFT, START - STEP, np.zeros((20_000, 20_000), np.uint8))
+    path = bag.write(tmp_path)
+    assert sum(file.stat().st_size for file in path.iterdir()) < 1e6
+    with raises("RIL-939"):
+        open_sequence(str(path))
+    assert resource.getrlimit(resource.RLIMIT_AS) == limits
 
 
 def test_a_large_file_that_is_called_as_a_bags_makes_no_bag(tmp_path):

@@ -1027,3 +1027,13 @@ roi: {{x_offset: {1}, y_offset: 20, height: 400, width: 600, do_rectify: false}}
         assert camera.T_camera_reference.translation == pytest.approx([-0.1, 0, 0])
     with raises("RIL-329", "roi"):
         read_cameras(written(tmp_path, text.format(-3, 40), "d.yaml"))
+
+
+@pytest.mark.parametrize("halved", [0, 1])
+def test_images_of_one_camera_that_were_made_smaller_are_refused_where_nothing_states_their_size(halved):
+    left, right = (camera(float(k), UNKNOWN_SIZE, name=name) for k, name in enumerate(("one", "two")))
+    sizes = [(640, 480), (640, 480)]
+    assert rig_of(left, right, tuple(sizes))
+    sizes[halved] = (320, 240)
+    with raises("RIL-974", f"of camera {(left, right)[halved].name} is", "the images are 320 x 240", "times 0.5"):
+        rig_of(left, right, tuple(sizes))

@@ -9,7 +9,7 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.samples import interlaced, mosaic
+from rille.datasets.images.samples import fixed_pattern, interlaced, mosaic
 from rille.datasets.registry import open_sequence
 
 
@@ -80,6 +80,22 @@ def test_rows_of_two_moments_are_said_when_they_are_opened(tmp_path):
         grey = cv2.cvtColor(cv2.GaussianBlur(coloured(), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
         cv2.imwrite(str(image), of_two_moments(grey, (5, 0)))
     assert sum("RIL-832" in line for line in open_sequence(str(path)).warnings) == 2
+
+
+@pytest.mark.parametrize("across", [(1, 192), (160, 1), (160, 192)], ids=["columns", "rows", "pixels"])
+def test_noise_that_keeps_its_place_is_told_from_scenes_that_move_or_rest(tmp_path, across):
+    random = np.random.default_rng(5)
+    scene = cv2.GaussianBlur(random.random((160, 300)).astype(np.float32), (0, 0), 1.5) * 600 - 180
+    pattern = random.normal(0, 15, across)
+    moving = [scene[:, 20 * k : 20 * k + 192] + random.normal(0, 2, (160, 192)) for k in range(3)]
+    assert fixed_pattern([image + pattern for image in moving]) > 0.4
+    assert max(map(fixed_pattern, (moving, [moving[0]] * 3, [0 * moving[0]] * 3, moving[:2]))) < 0.05
+    path = write_sequence(tmp_path, frames=3)
+    for side in ("left", "right"):
+        for image, name in zip(moving, sorted((tmp_path / side).glob("*.png")), strict=True):
+            cv2.imwrite(str(name), np.clip(image + (side == "left") * pattern, 0, 255).astype(np.uint8))
+    (line,) = [line for line in open_sequence(str(path)).warnings if "RIL-833" in line]
+    assert "left images" in line
 
 
 def turned(folder, tags, ending="jpg"):

@@ -158,7 +158,7 @@ def test_a_quiet_run_shows_no_progress(run: rille.Run, capsys: pytest.CaptureFix
     rille.reconstruct(sequence, **places, executor="inline", quiet=True, **STAGES)  # type: ignore[arg-type]
     said = capsys.readouterr()
     assert said.out.count("\n") == 1
-    assert all(line.startswith("rille: missing") for line in said.err.splitlines())
+    assert all(line.startswith("rille: note") for line in said.err.splitlines())
 
 
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:

@@ -78,6 +78,18 @@ def tear(frame: int, other: int) -> Callable[[Path], None]:
     return spoil
 
 
+def shift(frame: int, side: int) -> Callable[[Path], None]:
+    """Rows of one image of a frame are shifted from its middle on."""
+
+    def spoil(folder: Path) -> None:
+        path = str(files(folder, frame)[side])
+        image = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+        image[len(image) // 2 :] = np.roll(image[len(image) // 2 :], 12, axis=1)
+        assert cv2.imwrite(path, image)
+
+    return spoil
+
+
 def positions(folder: Path) -> np.ndarray:
     return np.loadtxt(folder / "trajectory.kitti").reshape(-1, 3, 4)[:, :, 3]
 
@@ -89,6 +101,8 @@ def positions(folder: Path) -> np.ndarray:
         pytest.param(change(3, lambda i: 0 * i), 3, "frame 3 lost: black left image", id="black, to be basic"),
         pytest.param(tear(4, 5), 4, "frame 4 lost: it shows two motions", id="torn"),
         pytest.param(tear(3, 6), 3, "frame 3 lost: it shows two motions", id="torn, to be basic"),
+        pytest.param(shift(3, 0), 3, "frame 3 lost: it shows two motions", id="left torn"),
+        pytest.param(shift(3, 1), 3, "frame 3 lost: its left and right do not fit", id="right torn"),
         pytest.param(swap(4), 4, "frame 4 lost: left and right are swapped", id="swapped"),
         pytest.param(
             lambda f: files(f, 4)[1].unlink(), 4, "frame 4 lost: right/000004.png is missing", id="right missing"

@@ -333,9 +333,9 @@ def read_out_contradiction(time: float, sigma: float) -> str:
     if not time:
         return ""
     return (
-        f"rows of an image are not of one time (rolling shutter): the tracks ask for {time:+.2f} +- {sigma:.2f} "
-        "intervals between frames from the first to the last; path and elevations are distorted, and the rig's yaw is "
-        "not corrected: use global shutters, or stand while images are taken"
+        "rows of an image are not of one time (rolling shutter), or lights move along with the cameras: the tracks ask "
+        f"for {time:+.2f} +- {sigma:.2f} intervals between frames from the first row to the last; path and elevations "
+        "are distorted, and the rig's yaw is not corrected: use global shutters, or stand while images are taken"
     )
 
 

@@ -48,6 +48,11 @@ MIN_JUMP_PX = 1.0
 rig was knocked; of sound rigs it stays below 0.2."""
 
 
+MAX_TORN_SHARE = 0.2
+"""Share of a basic pair's disparities that depart otherwise than the others, by twice :data:`MIN_JUMP_PX`, from which
+on a part of one image is displaced; of sound pairs 0.02 do, by night 0.1."""
+
+
 @dataclass(frozen=True)
 class SegmentPoses:
     """Poses of a segment's frames; see the stage's outputs. A lost frame has NaN, and its fact ``lost`` says why."""
@@ -182,19 +187,20 @@ class ResectInputs(NamedTuple):
     rig_after: Bundle[CalibrationFacts] | None = None
 
 
-def knocked(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> tuple[str, list[float]] | None:
-    """A line and a jump where the basic pair at the segment's end contradicts its own: the rig has moved.
+def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> dict[str, Any]:
+    """Facts of the basic pair at the segment's end where it contradicts the segment's own: the rig has moved, or a part
+    of one image is displaced.
 
     The jump is in pixels of the coarser image. A turn of a camera to the side shows in no row of one pair, but all its
-    disparities jump by as much. A turn of both pairs alike is none: the disparities of both are compared with the
-    landmarks as they were adjusted.
+    disparities jump by as much; a part of them does in an image that is torn. A turn of both pairs alike is none: the
+    disparities of both are compared with the landmarks as they were adjusted.
 
     Parameters
     ----------
     tracks : (point, frame, 2) pixels of the left images.
     """
     if inputs.after is None or inputs.rig_after is None or not np.isfinite(segment.poses[[0, -1]]).all():
-        return None
+        return {}
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
     use, off = segment.inlier[:, -1] != 0, []
@@ -204,15 +210,19 @@ def knocked(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> tu
         use &= matched
         off.append(disparity - (rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)))
     if use.sum() < MIN_LANDMARKS:
-        return None
-    jump = (np.median(off[1][use], axis=0) - np.median(off[0][use], axis=0)) / unit
+        return {}
+    departs = (off[1][use] - off[0][use]) / unit
+    jump = np.median(departs, axis=0)
+    torn = float((np.linalg.norm(departs - jump, axis=1) > 2 * MIN_JUMP_PX).mean())
+    if torn > MAX_TORN_SHARE:
+        return {"torn": torn}
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
-        return None
+        return {}
     line = (
         f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
         f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"
     )
-    return line, jump.tolist()
+    return {"knocked": line, "jump": jump.tolist(), "warnings": [f"{line}: calibrate anew from there on"]}
 
 
 @stage(
@@ -251,9 +261,7 @@ def resect_stage(
     if params.joint:
         opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
         meta["intrinsics"] = adjust_segment(points, segment, SegmentCameras(rig, opened, T_local_key), params)
-    if (jumped := knocked(tracks, segment, inputs)) is not None:
-        meta["knocked"], meta["jump"] = jumped
-        meta["warnings"] = [f"{jumped[0]}: calibrate anew from there on"]
+    meta |= of_pair_behind(tracks, segment, inputs)  # type: ignore[typeddict-item]
     for line in [fact["contradiction"] for fact in segment.facts if "contradiction" in fact]:
         meta["contradiction"], meta["warnings"] = line, [line]
     return Bundle({name: value for name, value in vars(segment).items() if name != "facts"}, meta)

@@ -67,7 +67,8 @@ def test_an_interrupt_ends_the_command():
 
 def test_figures_are_those_of_the_report(tmp_path):
     frames = [{"posed": True}, {"posed": False}, {"posed": True}, {"posed": True}]
-    report = {"metrics": {"trajectory_drift": {"value": 0.71234}}, "frames": frames, "missing": [{}, {}]}
+    report = {"metrics": {"trajectory_drift": {"value": 0.71234}}, "frames": frames}
+    report["missing"] = [{"kind": "failed"}, {"kind": "no pose"}, {"kind": "no path"}]
     report["stages"] = {"a": {"computed": 0, "cached": 2}, "b": {"computed": 1, "cached": 0}}
     (tmp_path / "report.json").write_text(json.dumps(report))
     row = batch.table([batch.Ended("street", HOLES, tmp_path, 12.34)], ["street"]).splitlines()[1]

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from rille.pipeline.flow.products import Products
-from rille.pipeline.report.delivery import contradictions, is_complete
+from rille.pipeline.report.delivery import contradictions, lacking
 
 
 def test_each_contradiction_is_one_line_and_the_run_is_not_complete() -> None:
@@ -14,4 +14,4 @@ def test_each_contradiction_is_one_line_and_the_run_is_not_complete() -> None:
     bundles = {label: SimpleNamespace(meta=meta) for label, meta in metas.items()}
     view = SimpleNamespace(products=products, bundle=bundles.get)
     assert contradictions(view) == ["left i with right i+1", "at pair 5"]  # type: ignore[arg-type]
-    assert not is_complete([{"kind": "contradiction", "what": "left i with right i+1", "why": ""}])
+    assert lacking([{"kind": "contradiction", "what": "left i with right i+1", "why": ""}])

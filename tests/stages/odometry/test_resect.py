@@ -22,7 +22,7 @@ from rille.stages.geometry.projection import perturbed
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
-from rille.stages.odometry.resection.resect import ResectInputs, SegmentPoints, knocked, resect_segment
+from rille.stages.odometry.resection.resect import ResectInputs, SegmentPoints, of_pair_behind, resect_segment
 from rille.stages.odometry.resection.robust_pose import ResectParams, resect
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
@@ -494,10 +494,11 @@ def test_a_vehicle_ahead_and_few_that_pass_leave_the_motion_as_it_is(near, far, 
 @pytest.mark.parametrize(
     ("column", "row", "told"), [(3.0, 0.0, True), (-2.0, 0.0, True), (0.0, 1.5, True), (0.5, 0.2, False)]
 )
+@pytest.mark.parametrize("torn", [0.0, 0.3, 0.7])
 @pytest.mark.parametrize(("finer", "before"), [(1.0, 0.0), (2.0, 0.0), (1.0, 2.5)])
-def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, finer, before):
+def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, finer, before, torn):
     """The later pair measures disparities that all depart alike from those of the landmarks, more than the earlier one,
-    whose camera may have been turned ``before``."""
+    whose camera may have been turned ``before``; or a share of them departs farther: one of its images is ``torn``."""
     rng = np.random.default_rng(31)
     step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.4]))
     right = Camera(*(finer * value for value in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)), 1200, 1000)
@@ -520,16 +521,21 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, fine
 
     same = Bundle({}, {"rig": rig.to_dict()})
     pairs = wall(RigidTransform.identity(), before, 0.0), wall(step, before + column, row)
+    rows = np.sort(given.tracks[:, 1, 1])
+    below = v > rows[-1 - round(torn * (len(rows) - 1))] + 0.5
+    pairs[1]["column_disparity"][below] += 20.0 * finer
     inputs = ResectInputs(Bundle({}, {}), Bundle({}, {}), same, *pairs, same)
-    jumped = knocked(given.tracks, found, inputs)
-    assert (jumped is not None) == told
-    if jumped is not None:
-        line, jump = jumped
-        np.testing.assert_allclose(jump, [column, row], atol=0.05)
-        assert line.startswith("the rig moved at pair 7")
-        assert f"{(column or row):+.1f} px in the" in line
+    facts = of_pair_behind(given.tracks, found, inputs)
+    if torn:
+        assert facts == {"torn": pytest.approx(min(torn, 1 - torn), abs=0.07)}
+        return
+    assert ("jump" in facts) == told
+    if told:
+        np.testing.assert_allclose(facts["jump"], [column, row], atol=0.05)
+        assert facts["knocked"].startswith("the rig moved at pair 7")
+        assert f"{(column or row):+.1f} px in the" in facts["knocked"]
     found.poses[-1] = np.nan  # the pair at the end has no pose: nothing is told
-    assert knocked(given.tracks, found, inputs) is None
+    assert of_pair_behind(given.tracks, found, inputs) == {}
 
 
 def with_a_lorry(beside, before, farthest=60):
