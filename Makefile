@@ -22,7 +22,7 @@ ARGS   ?=
 BENCHMARKS := $(filter-out record,$(sort $(basename $(notdir $(wildcard benchmarks/*.py)))))
 
 .DEFAULT_GOAL := help
-.PHONY: help install reconstruct test check torture bench lint pages changelog docs docs-fast clean
+.PHONY: help install reconstruct test check torture bench lint pages docs docs-fast clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -70,10 +70,6 @@ pages: $(TOOLS) ## pages of docs/ that follow from the code: messages, parameter
 	$(BIN)/rille params --markdown > docs/parameters.md
 	cd tests && for page in test_messages.py test_docs.py datasets/test_manifest_page.py pipeline/export/test_output.py; do \
 	  PYTHONPATH=.:stages:pipeline ../$(BIN)/python $$page || exit 1; done
-
-changelog: ## move the notes of changes/ to the end of CHANGELOG.md
-	@for note in $$(ls changes/*.md | grep -v README); do \
-	  sed -e '1s/^/- /' -e '2,$$s/^/  /' "$$note" >> CHANGELOG.md && rm "$$note"; done
 
 docs: $(VENV)/.docs ## the site in docs/_build, offline; the gallery and the tour are executed (minutes)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html

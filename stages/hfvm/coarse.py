@@ -1,4 +1,4 @@
-"""Coarse levels of a pair: prior disparities, correction of brightness, alignment by a plane or keypoints, matching.
+"""Coarse levels of a pair: prior disparities, brightness, alignment by a plane or keypoints, unlike focus.
 
 Known disparities replace those of the coarse levels at the level on which pre-alignment is decided (2), so that they
 serve that decision too, and are refined from there on like any other match. A search of one pixel at each level below
@@ -9,7 +9,11 @@ Brightness: where texture is weak, matches follow the gradient of brightness, an
 images, they are wrong. The logarithm of the ratio, left over right (vignetting, exposure), is a polynomial in the
 coordinates of the right image. It is fitted to the grey values of matches of a coarse level. Before there are matches,
 it is guessed from the grey values of each image as a whole, since both show nearly the same scene; the guess is used
-only if it gives more matches."""
+only if it gives more matches.
+
+Focus: where one image shows less detail, distances of features and residuals of the refinement measure the blur and not
+the displacement. The finest level then sees the sharper image through a Gaussian that leaves it as much.
+"""
 
 from __future__ import annotations
 
@@ -343,26 +347,37 @@ def turn(coarse: Coarse) -> Coarse:
     return max(coarse, turned, again, key=lambda tried: tried.share)
 
 
+Places = tuple[AnyArray, AnyArray]
+"""Rows and columns (n,) of pixels."""
+
+
+def matched_places(coarse: Coarse) -> tuple[Places, Places]:
+    """Pixels of consistent matches with texture, in the left image and in the right one as it came, at the level."""
+    state, h = coarse.state, coarse.alignment
+    layer, shape = coarse.images.left.layers[state.level], coarse.right.layers[state.level].shape
+    # 4000: places that tell the energies of texture to a few per cent.
+    y, x = thinned(state.left_ok & textured(layer, coarse.images.params), 4000)
+    own = np.eye(3) if h is None else plane.to_original(h, coarse.images.left.shapes[0])
+    to_level_0 = plane.finer(state.level)
+    ends = np.linalg.inv(to_level_0) @ own @ to_level_0
+    p, q, w = product(ends, x + state.left.u[y, x], y + state.left.v[y, x])
+    row, col = (np.clip(np.rint(a / w), 0, n - 1).astype(np.int64) for a, n in zip((q, p), shape, strict=True))
+    return (y, x), (row, col)
+
+
 def focus(coarse: Coarse) -> Coarse:
     """The same with the ``blur`` that leaves the sharper image the detail of the other one; none where both are alike.
 
     Detail is the energy of fine texture over that of coarser one, at the matches; not in an aligned image, which
     interpolation has blurred. Between images of other scale it follows from the scale.
     """
-    state, h, level = coarse.state, coarse.alignment, coarse.state.level
-    layer, right, shape = coarse.images.left.layers[level], coarse.right.layers[level], coarse.images.left.shapes[0]
-    larger = 1.0 if h is None else plane.scale(h, shape)
+    level, left = coarse.state.level, coarse.images.left
+    larger = 1.0 if coarse.alignment is None else plane.scale(coarse.alignment, left.shapes[0])
     if abs(math.log(larger)) > 0.15:
         # A pixel sees its square, whose variance is 1/12.
         blur = math.sqrt((max(larger, 1.0 / larger) ** 2 - 1.0) / 12.0)
         return replace(coarse, blur=(0.0, blur) if larger > 1.0 else (blur, 0.0))
-    # 4000: places that tell the energies to a few per cent.
-    y, x = thinned(state.left_ok & textured(layer, coarse.images.params), 4000)
-    own = np.eye(3) if h is None else plane.to_original(h, shape)
-    own = np.linalg.inv(plane.finer(level)) @ own @ plane.finer(level)
-    p, q, w = product(own, x + state.left.u[y, x], y + state.left.v[y, x])
-    ends = [np.clip(np.rint(a / w).astype(np.int64), 0, n - 1) for a, n in zip((q, p), right.shape, strict=True)]
-    shown: list[tuple[AnyArray, Any]] = [(layer.grey, (y, x)), (right.grey, tuple(ends))]
+    shown = tuple(zip((left.layers[level].grey, coarse.right.layers[level].grey), matched_places(coarse), strict=True))
 
     def bands(blur: float, side: int, widths: Sequence[float]) -> list[AnyArray]:
         grey, at = shown[side]
