@@ -196,14 +196,17 @@ def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
     return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 
-def settled(f: Matrix, u: AnyArray, v: AnyArray, wanted: AnyArray) -> AnyArray:
+@njit(cache=True, nogil=True)
+def settled(f, u, v, wanted):  # type: ignore[no-untyped-def]
     """Row displacements (row, col), those of the ``wanted`` pixels by their column displacements and their lines.
 
     Only where lines run along the rows rather than along the columns: there an error of the column is not enlarged.
     """
-    out, (y, x) = v.copy(), np.nonzero(wanted)
-    a, b, c = product(f, x, y)
-    along = np.abs(b) > np.abs(a)
-    a, b, c, x, y = (values[along] for values in (a, b, c, x, y))
-    out[y, x] = -(a * (x + u[y, x]) + c) / b - y
+    out = v.copy()
+    for y in range(v.shape[0]):
+        for x in range(v.shape[1]):
+            if wanted[y, x]:
+                a, b, c = product(f, x, y)
+                if abs(b) > abs(a):
+                    out[y, x] = -(a * (x + u[y, x]) + c) / b - y
     return out

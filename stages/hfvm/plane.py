@@ -126,17 +126,22 @@ def to_original(h: Matrix, left_shape: Shape) -> Matrix:
     return h @ translation(-margin(left_shape))
 
 
-def carried(g: AnyArray, u: AnyArray, v: AnyArray, x0: int = 0, y0: int = 0) -> tuple[AnyArray, AnyArray]:
+@njit(cache=True, nogil=True)
+def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Displacements (row, col) float32 to where a homography maps the ends of given ones.
 
     ``x0, y0``: first column and row of the left image's window. NaN beyond the horizon.
     """
-    # In double precision: the difference of two columns must keep their fractions.
-    y, x = np.ogrid[y0 : y0 + u.shape[0], x0 : x0 + u.shape[1]]
-    p, q, w = product(g, x + u, y + v)
-    # Points beyond the horizon would come back mirrored.
-    w = np.where(w > 0.0, w, np.nan)
-    return (p / w - x).astype(np.float32), (q / w - y).astype(np.float32)
+    out_u, out_v = np.empty(u.shape, np.float32), np.empty(u.shape, np.float32)
+    for row in range(u.shape[0]):
+        for col in range(u.shape[1]):
+            # In double precision: the difference of two columns must keep their fractions.
+            x, y = np.float64(col + x0), np.float64(row + y0)
+            p, q, w = product(g, x + u[row, col], y + v[row, col])
+            # Points beyond the horizon would come back mirrored.
+            w = w if w > 0.0 else np.nan
+            out_u[row, col], out_v[row, col] = p / w - x, q / w - y
+    return out_u, out_v
 
 
 def margin(left_shape: tuple[int, ...]) -> int:

@@ -109,13 +109,24 @@ def refine(
         step_u, step_v, rest, per_noise = planes
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
-    # Start displacements and residuals where steps led far or away from a fit. Residuals are those before a step: after
-    # a single one the last is the first, and the distance alone counts.
-    du, dv = now[0] - start[0], now[1] - start[1]
-    worse = ~((rests[-1] <= rests[0]) & (du * du + dv * dv <= np.float32(MAX_CORRECTION_PX**2)))
-    for values, before in zip((*now, rests[-1]), (*start, rests[0]), strict=True):
-        np.copyto(values, before, where=worse)
+    _take_back(start, rests[0], now, rests[-1])
     return Refined(*now, rests[-1], per_noise)
+
+
+@njit(cache=True, nogil=True)
+def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
+    """Start displacements and residuals where steps led far or away from a fit.
+
+    Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
+    """
+    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX**2)
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
+            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest)
+            new_u[y, x] = new_u[y, x] if better else u[y, x]
+            new_v[y, x] = new_v[y, x] if better else v[y, x]
+            last[y, x] = last[y, x] if better else first[y, x]
 
 
 @njit(cache=True, nogil=True)
