@@ -77,6 +77,7 @@ from rille.stages.facts.odometry import (
     PlacesFacts,
     ScreeningFacts,
     StepTableFacts,
+    TrajectoryFacts,
 )
 from rille.stages.facts.terrain import OverlapFacts, TileIndexFacts
 from rille.stages.geometry.geometry import RigidTransform
@@ -146,66 +147,105 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     # Frames that the trajectory goes through, and which of them are basic pairs.
     screening = yield from screened(make, whole)
     yield Complete(("image_quality", "frame_screening"))
-    missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
-    row = {frame: k for k, frame in enumerate(frames)}
-    # Where the tracks contradict the cameras, all that rests on these is laid out anew with corrected ones.
-    turn, since = 0, len(make.graph.nodes)
-    torn: dict[int, str] | None = None
-    while True:
-        if turn and p.crosscheck is not None:
-            p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
-        if found.choice is None:
-            return
-        chain, chosen, basic = found.chain, found.choice.keyframes, found.choice.basic
-        # From here on a frame is known by its place in the chain; `frames` keep the numbers of the sequence.
-        lost = sorted([*missing, *found.lost], key=lambda item: item["frame"])
-        yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, found.choice.rigs)
-
-        # Behind each basic pair: tracks, and poses in its frame. They show errors of the calibration.
-        ways = [[chain[i] for i in part] for part in chosen.meta["segments"]]
-        segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
-        segments, moved = yield from unmoved(make, matched, segments)
-        p.resections = [s.resection for s in segments]
-        wanted = without(segments, chain, torn)
-        if wanted != (torn or {}):
-            torn = wanted
-            make.again(since)
-            continue
-        asked = (yield from asked_for(make, matched[basic[0]])) if segments and make.config.resect.joint else None
-        if asked is None or turn == CALIBRATIONS:
-            break
-        make.recalibrate(asked["corrected"], since)
-        turn += 1
-    if p.intrinsics is not None:
-        p.contradictions.append(p.intrinsics)
+    fitting = yield from tracked(make, frames, whole, screening)
+    if fitting is None:
+        return
+    chosen, matched, segments = fitting.choice.keyframes, fitting.matched, fitting.segments
+    first = matched[fitting.choice.basic[0]]
 
     # At each basic pair, the rover's stop: local elevation model, hazards and path. In between: the segments' product.
-    pairs = local_models(make, [pair for k, pair in matched.items() if k not in moved], matched[basic[0]])
+    pairs = local_models(make, [pair for k, pair in matched.items() if k not in fitting.moved], first)
     yield Complete(("hfvm", "disparity_accuracy"))
+    missing = [{"frame": f, "cause": why} for f, why in make.sequence.lost.items() if f in frames]
     p.trajectory = make.node(
         trajectory_stage,
         "trajectory",
         segments=p.resections,
-        levels=[matched[s.frames[0]].level for s in segments] or [matched[basic[0]].level],
+        levels=[matched[s.frames[0]].level for s in segments] or [first.level],
         intrinsics=p.intrinsics,
         frames=list(frames),
         steps=steps_of(make, chosen),
-        lost=lost or None,
+        lost=sorted([*missing, *fitting.lost], key=lambda item: item["frame"]) or None,
     )
     yield from adjusted(make, frames, list(pairs.values()))
     assessment.of_trajectory(make, frames)
     yield Complete(("track", "resect", "intrinsics", "trajectory", "features", "loops", "loop", "adjust"))
     yield Complete(("agreement", "position_accuracy", "accuracy"))
     posed = yield from done(p.trajectory)
+    p.moving = moving_parts(make, segments, matched) if make.config.moving.enabled else {}
+    yield from merged_world(make, frames, pairs, posed)
 
-    # The world is that of the largest piece: its models, straight on the world lattice.
+
+@dataclass(frozen=True)
+class Tracked:
+    """Basic pairs that fit each other, as they are chosen and ``matched``, and the tracks behind them.
+
+    ``lost``: frames (frame and cause); ``moved``: pairs before which the rig was knocked.
+    """
+
+    choice: Choice
+    lost: list[dict[str, Any]]
+    matched: dict[int, BasicPair]
+    segments: list[Segment]
+    moved: set[int]
+
+
+def tracked(
+    make: Builder, frames: Series[int], whole: list[int], screening: Ref[ScreeningFacts]
+) -> Generator[Wait, Any, Tracked | None]:
+    """Match the basic pairs and track between them; None where nothing can be measured.
+
+    While tracks contradict images, go on without these; while they contradict the cameras, lay out anew with corrected
+    ones all that rests on these.
+    """
+    p, turn, since = make.products, 0, len(make.graph.nodes)
+    torn: dict[int, str] | None = None
+    while True:
+        if turn and p.crosscheck is not None:
+            p.crosscheck = another_program(make, whole)
+        found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
+        choice = found.choice
+        if choice is None:
+            return None
+        yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
+        matched = yield from matched_pairs(make, choice.rigs)
+
+        # Behind each basic pair: tracks, and poses in its frame. A frame is known by its place in the chain.
+        ways = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
+        segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
+        segments, moved = yield from unmoved(make, matched, segments)
+        p.resections = [s.resection for s in segments]
+        wanted = without(segments, found.chain, torn)
+        if wanted != (torn or {}):
+            torn = wanted
+            make.again(since)
+            continue
+        key = matched[choice.basic[0]]
+        asked = (yield from asked_for(make, key)) if segments and make.config.resect.joint else None
+        if asked is None or turn == CALIBRATIONS:
+            if p.intrinsics is not None:
+                p.contradictions.append(p.intrinsics)
+            return Tracked(choice, found.lost, matched, segments, moved)
+        make.recalibrate(asked["corrected"], since)
+        turn += 1
+
+
+def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], posed: Ref[TrajectoryFacts]) -> Steps:
+    """The largest piece of the trajectory: its models straight on the world lattice, merged; hazards and the path.
+
+    Raises
+    ------
+    DegenerateError
+        No elevation model has a cell in the world.
+    """
+    p = make.products
+    assert p.trajectory is not None
+    positions = dict(zip(frames, posed.meta["positions"], strict=True))
+    row = {frame: k for k, frame in enumerate(frames)}
     start, end = posed.meta["pieces"][posed.meta["main"]]
     world = set(posed.meta.get("world", range(start, end + 1)))
-    p.moving = moving_parts(make, segments, matched) if make.config.moving.enabled else {}
     # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
-    there = [k for k in pairs if k in world and posed.meta["positions"][row[k]]]
+    there = [k for k in pairs if k in world and positions[k]]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
     prints = [
@@ -232,7 +272,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        begin = posed.meta["positions"][row[start]]
+        begin = positions[start]
         p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", begin=begin and begin[:2])
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
