@@ -17,11 +17,12 @@ class DisparityFacts(Facts):
 
 
 class TileFacts(Facts, total=False):
-    """Of the coarse levels: ``level``, cost ``mu`` of the band, sign of depth ``near_sign`` (``hfvm.level.State``). Of
-    the ending: ``terms`` of textureless planes."""
+    """Of the coarse levels: ``level``, cost ``mu`` of the band, sign of depth ``near_sign`` (``hfvm.level.State``),
+    ``blur`` of both images (``hfvm.coarse.focus``). Of the ending: ``terms`` of textureless planes."""
 
     level: int
     aligned: bool
     mu: float
     near_sign: float
+    blur: list[float]
     terms: list[Any]

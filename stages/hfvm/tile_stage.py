@@ -119,7 +119,8 @@ class Task:
         oks, band = (left[2] != 0, right[2] != 0), Band(bundle["f"], meta["mu"])
         state = State(meta["level"], Map(*left[:2]), Map(*right[:2]), *oks, band, meta["near_sign"])
         ratio, alignment = (bundle.arrays.get(name) for name in ("ratio", "alignment"))
-        return Coarse(self.images, state, self.images.right, ratio, alignment).seen()
+        blur = meta["blur"][0], meta["blur"][1]
+        return Coarse(self.images, state, self.images.right, ratio, alignment, blur=blur).seen()
 
     def fine(self, window: Window, names: Sequence[str] = FINE) -> dict[str, AnyArray]:
         """Arrays of the tiles' fine results."""
@@ -131,8 +132,14 @@ def _coarse(task: Task) -> Bundle[TileFacts]:
     s = pair.state
     arrays = {"left": np.stack([*s.left, s.left_ok]), "right": np.stack([*s.right, s.right_ok]), "f": s.band.f}
     arrays |= {name: a for name, a in (("ratio", pair.ratio), ("alignment", pair.alignment)) if a is not None}
-    aligned, near_sign = pair.alignment is not None, float(s.near_sign)
-    return Bundle(arrays, {"level": s.level, "aligned": aligned, "mu": float(s.band.mu), "near_sign": near_sign})
+    meta: TileFacts = {
+        "level": s.level,
+        "aligned": pair.alignment is not None,
+        "mu": float(s.band.mu),
+        "near_sign": float(s.near_sign),
+        "blur": list(pair.blur),
+    }
+    return Bundle(arrays, meta)
 
 
 def _fine(task: Task) -> Bundle[TileFacts]:

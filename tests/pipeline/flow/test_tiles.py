@@ -57,8 +57,12 @@ def disparity(store, images, params, side):
     return node.ref
 
 
-@pytest.mark.parametrize(("preset", "side"), [("default", 160), ("fast", 100)])
-def test_the_artifact_is_nearly_that_of_the_pair_matched_whole(tmp_path, images, preset, side):
+@pytest.mark.parametrize(("preset", "side", "blur"), [("default", 160, 0), ("fast", 100, 0), ("default", 160, 2)])
+def test_the_artifact_is_nearly_that_of_the_pair_matched_whole(tmp_path, images, preset, side, blur):
+    if blur:
+        soft = tmp_path / "right.png"
+        cv2.imwrite(str(soft), cv2.GaussianBlur(cv2.imread(str(images["right"]), cv2.IMREAD_GRAYSCALE), None, blur))
+        images = images | {"right": soft}
     store, params = Store(tmp_path), HfvmParams(preset=preset)
     once = disparity(store, images, params, None)
     assert once.meta["aligned"]

@@ -1,5 +1,6 @@
 """Tiles give what the whole image gives, but for a thousandth of the pixels; denoising; windows."""
 
+import cv2
 import numpy as np
 import pytest
 from matching_scenes import pair
@@ -46,8 +47,15 @@ def vignetted():
     return left, right * (1 - 0.3 * (x**2 + y[:, None] ** 2))
 
 
+def unfocused():
+    """A left image that is out of focus."""
+    left, right, *_ = pair(lambda x, y: (-9 + 4 * np.sin(x / 30) * np.cos(y / 25), 0 * x), SHAPE)
+    return cv2.GaussianBlur(left, None, 1.5), right
+
+
 @pytest.mark.parametrize(
-    ("scene", "aligned"), [(misaligned, False), (sheared, True), (noisy, False), (vignetted, False)]
+    ("scene", "aligned"),
+    [(misaligned, False), (sheared, True), (noisy, False), (vignetted, False), (unfocused, False)],
 )
 @pytest.mark.parametrize("preset", ["default", "fast"])
 def test_tiles_are_within_a_hundredth_of_a_pixel_of_the_whole(scene, aligned, preset):
