@@ -18,8 +18,11 @@ from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
-USUAL_BASELINE, LONGEST_BASELINE = 1.5, 20.0
-"""m; few vehicles carry a longer one than the first, none than the second, but 97 (mm) is a common slip."""
+USUAL_BASELINE = 1.5
+"""m; few vehicles carry a longer one, but a square of a chessboard or a centimetre is a common slip."""
+
+LONGEST_BASELINE = 20.0
+"""m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
 
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""

@@ -75,6 +75,7 @@ from rille.stages.facts.odometry import (
     LoopFacts,
     MovingFacts,
     PlacesFacts,
+    ResectFacts,
     ScreeningFacts,
     StepTableFacts,
     TrajectoryFacts,
@@ -215,7 +216,7 @@ def tracked(
         segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
         segments, moved = yield from unmoved(make, matched, segments)
         p.resections = [s.resection for s in segments]
-        wanted = without(segments, found.chain, torn)
+        wanted = suspected(segments, found.chain) if torn is None else kept_out(segments, found.chain, torn)
         if wanted != (torn or {}):
             torn = wanted
             make.again(since)
@@ -445,24 +446,21 @@ def simultaneous(
             return Simultaneous(chain, lost, choice)
 
 
-def without(segments: list[Segment], chain: list[int], tried: dict[int, str] | None) -> dict[int, str]:
-    """Frames to go on without, and why; of those that were ``tried``, which are kept out.
+def resected(segments: list[Segment]) -> list[ResectFacts]:
+    """Facts of the segments; a plan may have none."""
+    return [s.resection.ref.meta for s in segments if s.resection.ref is not None]
+
+
+def suspected(segments: list[Segment], chain: list[int]) -> dict[int, str]:
+    """Frames to go on without, and why.
 
     Left and right of a pair do not fit each other where a part of its disparities departs from the landmarks' (in few
     pairs: many do so where matches are bad). Two motions are shown by the first of the frames whose landmarks show
     them, or the one before it, in which many landmarks were lost; and by a basic pair that part of the landmarks
-    contradicts, those before it and its own. Behind something that moves by itself frames show two as well: such a
-    frame is kept out only where nearly all landmarks of the frame behind then have one motion.
+    contradicts, those before it and its own.
     """
-    # A plan may have no facts.
-    metas = [s.resection.ref.meta for s in segments if s.resection.ref is not None]
+    metas = resected(segments)
     parts = [meta["per_frame"] for meta in metas if meta.get("per_frame")]
-    if tried is not None:
-        facts = {one["frame"]: one for part in parts for one in part[1:]}
-        behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
-        # 0.8: of its landmarks.
-        one_motion = {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
-        return {f: why for f, why in tried.items() if why == ODD or f in one_motion}
     odd = {meta["per_frame"][-1]["frame"] for meta in metas if "torn" in meta}
     if 4 * len(odd) > len(parts) + 1:
         odd.clear()
@@ -476,6 +474,19 @@ def without(segments: list[Segment], chain: list[int], tried: dict[int, str] | N
     split = {one["frame"] for one in behind_key if one["inliers"] < 0.7 * one["landmarks"]}
     pairs = [part[0]["frame"] for part in parts if {one["frame"] for one in part[:2]} <= split]
     return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, ODD)
+
+
+def kept_out(segments: list[Segment], chain: list[int], tried: dict[int, str]) -> dict[int, str]:
+    """Of the frames that it was ``tried`` to go on without, those that stay out.
+
+    Behind something that moves by itself frames show two motions as well: such a frame is kept out only where nearly
+    all landmarks of the frame behind then have one motion.
+    """
+    facts = {one["frame"]: one for meta in resected(segments) for one in meta.get("per_frame", [])[1:]}
+    behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
+    # 0.8: of its landmarks.
+    one_motion = {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
+    return {f: why for f, why in tried.items() if why == ODD or f in one_motion}
 
 
 def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:

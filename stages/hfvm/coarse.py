@@ -271,15 +271,15 @@ class Coarse:
         right = self.right if self.alignment is None else plane.aligned(self.right, self.alignment, self.images.left)
         return replace(self, images=replace(self.images, right=right))
 
-    def anew(self, covering: bool = False, **changed: Any) -> Coarse:
-        """Coarse levels of the images with another ``ratio`` or ``alignment``; ``covering``: by which they are known to
-        lie on each other."""
+    def anew(self, registered: bool = False, **changed: Any) -> Coarse:
+        """Coarse levels of the images with another ``ratio`` or ``alignment``; ``registered``: by which they are known
+        to lie on each other."""
         other = replace(self, **changed).seen()
-        above = still(other.images) if covering else None
+        above = registration(other.images) if registered else None
         return replace(other, state=descend(other.images, COARSE_LEVEL, above, other.state.near_sign))
 
 
-def still(images: PyramidPair) -> State:
+def registration(images: PyramidPair) -> State:
     """State above the top in which the right image, which was aligned, lies on the left one."""
     level, by = images.levels, plane.margin(images.left.shapes[0]) >> images.levels
     a, b = (tuple((n + 1) // 2 for n in image.shapes[level - 1]) for image in (images.left, images.right))
@@ -340,10 +340,10 @@ def turn(coarse: Coarse) -> Coarse:
     # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
     # The right image may show a part of the left one, or the other way round: coarse levels would find chance there.
-    turned = upright.anew(covering=True, alignment=h)
+    turned = upright.anew(registered=True, alignment=h)
     # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
     h = plane.refitted(sample(turned.images, turned.state), turned.state.level, left.shapes, h)
-    again = turned if h is None else upright.anew(covering=True, alignment=h)
+    again = turned if h is None else upright.anew(registered=True, alignment=h)
     return max(coarse, turned, again, key=lambda tried: tried.share)
 
 
@@ -373,6 +373,7 @@ def focus(coarse: Coarse) -> Coarse:
     """
     level, left = coarse.state.level, coarse.images.left
     larger = 1.0 if coarse.alignment is None else plane.scale(coarse.alignment, left.shapes[0])
+    # 0.15: of the scale; less difference of detail than that of cameras of one kind.
     if abs(math.log(larger)) > 0.15:
         # A pixel sees its square, whose variance is 1/12.
         blur = math.sqrt((max(larger, 1.0 / larger) ** 2 - 1.0) / 12.0)

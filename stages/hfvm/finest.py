@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -154,6 +155,7 @@ class FinestWork:
     upright: bool = False
     blur: tuple[float, float] = (0.0, 0.0)
 
+    @cached_property
     def alike(self) -> FinestWork:
         """The same with the detail that both images show."""
         left, right = self.blur
@@ -245,7 +247,7 @@ def check(work: FinestWork, fine: Fine) -> Fine:
 
 def refine(work: FinestWork, fine: Fine) -> Fine:
     """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
-    keep, work = fine.keep, work.alike()
+    keep, work = fine.keep, work.alike
     # An image that a plane has aligned is sheared, and takes a step more.
     how = 1 if work.alignment is None else 2, work.upright
     u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
@@ -262,7 +264,7 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
     """A piecewise smooth relief fitted to all matches along their epipolar lines."""
-    work = work.alike()
+    work = work.alike
     u, v = work.from_right(*refinement.fit_relief(work.compared(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
