@@ -252,8 +252,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Warns
     -----
     UserWarning
-        Hardly a pixel matches, most have no texture, left and right seem swapped, or samples of 16 bits use a small
-        part of their range and are spread.
+        Hardly a pixel matches, most have no texture, left and right seem swapped, one image is blurred beside the other
+        one, or samples of 16 bits use a small part of their range and are spread.
 
     Examples
     --------
@@ -291,11 +291,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
     disparity = match_pyramids(first, second, built.hfvm, how=how)
-    arrays = {name: value for name, value in vars(disparity).items() if name != "aligned"}
-    meta = facts(arrays, built.hfvm, disparity.aligned, int(np.count_nonzero(first.valid[0])))
+    meta = facts(disparity.arrays, built.hfvm, disparity.unlike, int(np.count_nonzero(first.valid[0])))
     for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)
-    return _dataset(hfvm_stage, Bundle(arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+    return _dataset(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}))
 
 
 def _rows_first(image: Any) -> Any:

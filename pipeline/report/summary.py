@@ -103,7 +103,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))
-    lines += _sensors(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
+    lines += _blurred(view) + _sensors(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
     if compared is not None and compared.flagged.any():
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
@@ -191,6 +191,18 @@ def _displaced(view: RunView) -> list[str]:
         f"this run's world begins at frame {first}: rasters and path.gpkg are displaced on Earth, unless world.origin "
         f"and world.azimuth_deg are those of frame {first}"
     ]
+
+
+def _blurred(view: RunView) -> list[str]:
+    """One camera shows less detail than the other one."""
+    blurs = [facts_of(view, handle).get("blur", 0.0) for handle in view.products.disparity.values()]
+    # Of pairs of two sharp cameras some differ by chance.
+    blur = float(np.median(blurs)) if blurs else 0.0
+    which, other = ("right", "left") if blur > 0 else ("left", "right")
+    text = (
+        f"the {which} images are blurred by {abs(blur):.1f} px beside the {other} ones: out of focus, or a dirty lens?"
+    )
+    return [text] if blur else []
 
 
 def _sensors(view: RunView) -> list[str]:

@@ -45,7 +45,12 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
     explains_all = _unmatched(result) or _without_texture(result) or one or (_exchanged(result, ok) if alike else "")
     if explains_all:
         yield explains_all
-    elif closely:
+        return
+    if result.unlike.blur:
+        which, other = ("right", "left") if result.unlike.blur > 0 else ("left", "right")
+        text = f"the {which} image is blurred by {abs(result.unlike.blur):.1f} px beside the {other} one: out of focus?"
+        yield warning("RIL-710", text)
+    if closely:
         yield from _wrong_matches(result, left, right, ok)
 
 

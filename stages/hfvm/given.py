@@ -25,6 +25,7 @@ from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.coarse import (
     MIN_LOG_RATIO,
     PriorDisparities,
+    Unlike,
     greatest,
     impose,
     known_beforehand,
@@ -90,4 +91,4 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
         # Where a map of it says nothing the estimate stays.
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)
         arrays["disparity_std"] = np.where(stated, given["disparity_std"], arrays["disparity_std"])
-    return Bundle(arrays, facts(arrays, params, False, int(np.count_nonzero(a.valid[0]))))
+    return Bundle(arrays, facts(arrays, params, Unlike(), int(np.count_nonzero(a.valid[0]))))

@@ -14,7 +14,7 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
-from rille.stages.hfvm.coarse import PriorDisparities
+from rille.stages.hfvm.coarse import PriorDisparities, Unlike
 from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import PyramidPair, Recipe
@@ -143,14 +143,14 @@ Arrays = dict[str, AnyArray]
 
 def match(
     left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None, how: How
-) -> tuple[Arrays, bool]:
+) -> tuple[Arrays, Unlike]:
     """Dense displacements from the left image to the right one (4.3), step by step.
 
-    Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and whether the right image was aligned.
+    Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and how the right image differs.
     """
     if halves(params, left.levels, right.levels):
-        half, aligned = match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how)
-        return doubled(half, left.valid[0], right.shape, (0, 0)), aligned
+        half, unlike = match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how)
+        return doubled(half, left.valid[0], right.shape, (0, 0)), unlike.doubled()
     how.tell(0.0, "coarse levels")
     pyramids = as_matched(left, params), as_matched(right, params)
     images = PyramidPair(*pyramids, params, RECIPES[params.preset], how.threads)
@@ -165,4 +165,4 @@ def match(
     how.tell(0.9, "filling")
     ending = finest.fit_lines_and_planes(pair, matches)
     final = {w: partial(finest.interpolate_undefined, pair, w, matches, ending) for w in windows}  # 4.3.4
-    return finest.put_together(final, left.shape, how.threads), pair.alignment is not None
+    return finest.put_together(final, left.shape, how.threads), pair.unlike

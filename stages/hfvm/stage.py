@@ -25,7 +25,7 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper
-from rille.stages.hfvm.coarse import PriorDisparities, known_beforehand
+from rille.stages.hfvm.coarse import PriorDisparities, Unlike, known_beforehand
 from rille.stages.hfvm.matcher import WHOLE, How
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
@@ -49,8 +49,7 @@ class StereoMatches:
     whole-pixel match (byte steps; preset ``paper``: Eq. 1, grey levels), NaN on such planes and where the match
     leaves the right image. ``disparity_std``: float32 pixels, standard deviation of the column disparity, or of the
     row's, where cameras stand one above the other (see
-    :mod:`~rille.stages.hfvm.refinement`), NaN where not ``MATCHED``. ``aligned``: whether the right image was
-    pre-aligned by a plane.
+    :mod:`~rille.stages.hfvm.refinement`), NaN where not ``MATCHED``. ``unlike``: how the right image differs.
     """
 
     column_disparity: Map
@@ -59,7 +58,12 @@ class StereoMatches:
     backmatch_error: Map
     distance: Map
     disparity_std: Map
-    aligned: bool
+    unlike: Unlike
+
+    @property
+    def arrays(self) -> dict[str, AnyArray]:
+        """All arrays by name."""
+        return {output.name: getattr(self, output.name) for output in OUTPUTS}
 
 
 def match(
@@ -103,22 +107,25 @@ def match_pyramids(
 ) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
-        arrays, aligned = paper.match(left, right, params, how.tell), False
+        arrays, unlike = paper.match(left, right, params, how.tell), Unlike()
     else:
-        arrays, aligned = matcher.match(left, right, params, prior, how)
-    return StereoMatches(**arrays, aligned=aligned)
+        arrays, unlike = matcher.match(left, right, params, prior, how)
+    return StereoMatches(**arrays, unlike=unlike)
 
 
-def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, aligned: bool, usable: int) -> DisparityFacts:
+def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, unlike: Unlike, usable: int) -> DisparityFacts:
     """Facts of disparities; ``usable``: how many pixels of the left image are."""
     bits = counts(arrays["validity"])
-    return {
+    found: DisparityFacts = {
         "preset": params.preset,
-        "aligned": aligned,
+        "aligned": unlike.aligned,
         "usable": usable,
         "match_rate": bits["matched"] / usable if usable else None,
         "counts": bits,
     }
+    if unlike.blur:
+        found["blur"] = unlike.blur
+    return found
 
 
 _GRID = ("row", "col")
@@ -141,6 +148,5 @@ OUTPUTS = (
 def hfvm_stage(params: HfvmParams, left: Bundle, right: Bundle) -> Bundle[DisparityFacts]:
     """Dense two-dimensional disparities of a stereo pair by hierarchical feature vector matching."""
     a, b = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
-    arrays = vars(match_pyramids(a, b, params))
-    aligned = arrays.pop("aligned")
-    return Bundle(arrays, facts(arrays, params, aligned, int(np.count_nonzero(a.valid[0]))))
+    found = match_pyramids(a, b, params)
+    return Bundle(found.arrays, facts(found.arrays, params, found.unlike, int(np.count_nonzero(a.valid[0]))))

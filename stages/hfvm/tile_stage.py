@@ -134,7 +134,7 @@ def _coarse(task: Task) -> Bundle[TileFacts]:
     arrays |= {name: a for name, a in (("ratio", pair.ratio), ("alignment", pair.alignment)) if a is not None}
     meta: TileFacts = {
         "level": s.level,
-        "aligned": pair.alignment is not None,
+        "unlike": pair.unlike,
         "mu": float(s.band.mu),
         "near_sign": float(s.near_sign),
         "blur": list(pair.blur),

@@ -236,6 +236,20 @@ def test_a_place_on_earth_is_that_of_the_first_camera(main: int, told: int) -> N
     assert all("world begins at frame 2" in line for line in lines)
 
 
+@pytest.mark.parametrize(
+    ("blurs", "told"), [([1.9, 1.8, None], "right"), ([-1.5, -1.5], "left"), ([1.2, None, None], "")]
+)
+def test_a_camera_that_is_out_of_focus_is_named(blurs: list[float | None], told: str) -> None:
+    made, found = bundles(), checked()
+    found.disparity.clear()
+    for k, blur in enumerate(blurs):
+        found.disparity[k] = f"disparity/{k}"  # type: ignore[assignment]
+        made[f"disparity/{k}"] = Bundle({}, {} if blur is None else {"blur": blur})
+    lines = summary._blurred(view(made, products=found))
+    assert len(lines) == bool(told)
+    assert all(line.startswith(f"the {told} images are blurred by 1.") for line in lines), lines
+
+
 def test_one_frame_that_is_left_of_all_is_no_choice_of_pairs(tmp_path: Path) -> None:
     made, found = bundles() | checks(), checked()
     found.screening = "screening"  # type: ignore[assignment]

@@ -87,8 +87,8 @@ def test_alignment_by_a_plane_is_what_makes_sheared_ground_match():
     left, right, u, v = pair(lambda x, y: (10.0 - 0.55 * y, 0.01 * x), (160, 200), (160, 220), noise=1.0)
     aligned = match(left, right)
     plain = match(left, right, HfvmParams(without=("align",)))
-    assert aligned.aligned
-    assert not plain.aligned
+    assert aligned.unlike.aligned
+    assert not plain.unlike.aligned
     error, _, complete = score(aligned, u, v, right.shape)
     plain_error, _, plain_complete = score(plain, u, v, right.shape)
     # Noise alone costs .03 px; the right image lies 0.55 columns a row askew in the last, refining windows.

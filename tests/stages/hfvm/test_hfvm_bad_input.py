@@ -201,7 +201,7 @@ def test_exact_and_partial_prior_change_little_on_a_plain_pair():
 def test_prior_is_carried_over_to_the_aligned_image():
     left, right, u, v = pair(lambda x, y: (10.0 - 0.55 * y, 0.01 * x), (160, 200), (160, 220), noise=1.0)
     led = match(left, right, prior=(u, v))
-    assert led.aligned
+    assert led.unlike.aligned
     good, complete = share_within(led, u, v, right.shape, 0.5)
     assert good > 0.97
     assert complete > 0.93

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from matching_scenes import seen
 
+from rille.pipeline.runs.doubts import doubts
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import coarse
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 
@@ -31,38 +31,42 @@ def views(blur_left=0.0, blur_right=0.0, noise=1.0):
     return *out, u
 
 
-def found_blur(monkeypatch, left, right):
-    """What the matcher takes the blur of the left and the right image to be missing."""
-    seen_blur, focus = [], coarse.focus
-
-    def told(pair):
-        out = focus(pair)
-        seen_blur.append(out.blur)
-        return out
-
-    monkeypatch.setattr(coarse, "focus", told)
-    match(left, right)
-    return seen_blur[-1]
-
-
 @pytest.mark.parametrize("blur", [1.2, 2.0, 3.0])
 @pytest.mark.parametrize("left", [True, False])
-def test_the_sharper_image_is_blurred_as_the_other_one_is(monkeypatch, blur, left):
+def test_the_blur_of_one_image_is_found_and_named(blur, left):
     a, b, _ = views(*((blur, 0.0) if left else (0.0, blur)))
-    of_left, of_right = found_blur(monkeypatch, a, b)
-    assert (of_left, of_right)[left] == pytest.approx(blur, rel=0.15)
-    assert (of_left, of_right)[not left] == 0
+    found = match(a, b)
+    assert found.unlike.blur == pytest.approx(-blur if left else blur, rel=0.15)
+    (line,) = doubts(found, a, b)
+    assert line.startswith(f"RIL-710: the {'left' if left else 'right'} image is blurred by")
+
+
+def test_blur_is_in_pixels_of_the_images_at_half_their_resolution_too():
+    a, b, _ = views(0.0, 3.0)
+    assert match(a, b, HfvmParams(preset="fast")).unlike.blur == pytest.approx(3.0, rel=0.2)
+
+
+def test_detail_that_the_scale_takes_is_no_blur():
+    a, b, _ = views()
+    found = match(a, cv2.resize(b, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
+    assert found.unlike.aligned
+    assert found.unlike.blur == 0
 
 
 @pytest.mark.parametrize("both", [0.0, 2.0])
-def test_images_alike_stay_as_they_are(monkeypatch, both):
+def test_images_alike_stay_as_they_are(both):
     a, b, _ = views(both, both)
-    assert found_blur(monkeypatch, a, b) == (0.0, 0.0)
+    assert match(a, b).unlike.blur == 0
 
 
-def test_images_without_texture_stay_as_they_are(monkeypatch):
+def test_few_pixels_tell_no_blur():
+    a, b, _ = views(blur_right=2.0)
+    assert match(a[:60, :80], b[:60, :80]).unlike.blur == 0
+
+
+def test_images_without_texture_stay_as_they_are():
     flat = np.full(SHAPE, 90, np.float32)
-    assert found_blur(monkeypatch, flat, flat) == (0.0, 0.0)
+    assert match(flat, flat).unlike.blur == 0
 
 
 @pytest.mark.parametrize("preset", ["default", "accurate"])
@@ -79,9 +83,9 @@ def test_a_blurred_image_is_matched(preset):
 
 
 @pytest.mark.data
-def test_wrong_matches_tell_no_blur(monkeypatch, data_dir):
+def test_wrong_matches_tell_no_blur(data_dir):
     left, right = (
         cv2.imread(str(data_dir / "middlebury0506" / "Baby1" / f"view{k}.png"), cv2.IMREAD_GRAYSCALE) for k in (1, 5)
     )
     # A row offset of 64 pixels makes more of them: then the left image seemed to be sharper by 1.8 pixels.
-    assert found_blur(monkeypatch, left, cv2.copyMakeBorder(right, 64, 64, 64, 64, cv2.BORDER_CONSTANT)) == (0.0, 0.0)
+    assert match(left, cv2.copyMakeBorder(right, 64, 64, 64, 64, cv2.BORDER_CONSTANT)).unlike.blur == 0

@@ -36,7 +36,7 @@ def test_turned_views_are_matched_in_their_own_frame(degrees, scale, slant):
     found = match(left, right)
     both = seen(u, v, right.shape, 12)
     error = np.hypot(found.column_disparity - u, found.row_disparity - v)
-    assert found.aligned
+    assert found.unlike.aligned
     assert np.mean(matched(found.validity)[both]) > 0.9
     # In pixels of the right image, of which one of the left one is as many wide.
     assert np.median(error[both & matched(found.validity)]) < 0.1 * max(scale, 1.0)
@@ -59,7 +59,7 @@ def test_texture_as_fine_as_pixels_is_found_in_views_of_other_scale(left_px, rig
     found = match(left, right)
     both = seen(u, v, right.shape, 12)
     error = np.hypot(found.column_disparity - u, found.row_disparity - v)
-    assert found.aligned
+    assert found.unlike.aligned
     assert np.mean((matched(found.validity) & (error < 1))[both]) > 0.6
     assert np.mean(error[both] < 1) > 0.95
 
