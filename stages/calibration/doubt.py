@@ -98,21 +98,28 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     looks_alike = []
     for (x, y), (p, q) in zip(*(np.rint(side[chosen]).astype(int) for side in places), strict=True):
         patch = a[y - PATCH_RADIUS_PX : y + PATCH_RADIUS_PX + 1, x - PATCH_RADIUS_PX : x + PATCH_RADIUS_PX + 1]
-        y0, x0 = max(q - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0), max(p - SEARCH_REACH_PX - PATCH_RADIUS_PX, 0)
-        around = b[y0 : q + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1, x0 : p + SEARCH_REACH_PX + PATCH_RADIUS_PX + 1]
-        score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
-        j, i = np.indices(score.shape)
-        j, i = j + y0 + PATCH_RADIUS_PX, i + x0 + PATCH_RADIUS_PX
-        # The match has been rounded, so that its peak may lie beside it.
-        own = float(score[np.hypot(j - q, i - p) <= 2].max())
-        # 0.7: least correlation of a match whose patch says anything.
-        if not np.isfinite(own) or own < 0.7:
-            continue
+        (y0, y1), (x0, x1) = (
+            (max(at - SEARCH_REACH_PX, PATCH_RADIUS_PX), min(at + SEARCH_REACH_PX, size - 1 - PATCH_RADIUS_PX))
+            for at, size in zip((q, p), b.shape, strict=True)
+        )
+        j, i = np.ogrid[y0 : y1 + 1, x0 : x1 + 1]
         # Without lines the row through the match stands in.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
         here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
+        away = (j - q) ** 2 + (i - p) ** 2
+        # The match has been rounded, so that its peak may lie beside it.
+        beside = away <= 2**2
+        # Nothing but the strip that holds these is correlated, since that takes the time.
+        strip = tuple(slice(k.min(), k.max() + 1) for k in np.nonzero(here | beside))
+        around = b[y0 - PATCH_RADIUS_PX : y1 + PATCH_RADIUS_PX + 1, x0 - PATCH_RADIUS_PX : x1 + PATCH_RADIUS_PX + 1]
+        around = around[tuple(slice(s.start, s.stop + 2 * PATCH_RADIUS_PX) for s in strip)]
+        score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
+        own = float(score[beside[strip]].max())
+        # 0.7: least correlation of a match whose patch says anything.
+        if not np.isfinite(own) or own < 0.7:
+            continue
         # 8 pixels: how far from its match a likeness counts.
-        elsewhere = score[here & (np.hypot(j - q, i - p) >= 8)]
+        elsewhere = score[(here & (away >= 8**2))[strip]]
         # 0.05: by how much less than the match a likeness may correlate.
         looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
