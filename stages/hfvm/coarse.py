@@ -1,15 +1,4 @@
-"""Coarse levels of a pair: prior disparities, brightness, alignment by a plane or keypoints, unlike focus.
-
-Known disparities replace those of the coarse levels at the level on which pre-alignment is decided (2), so that they
-serve that decision too, and are refined from there on like any other match. A search of one pixel at each level below
-corrects an error of 3 px at full resolution, propagation from better neighbours a greater one. Where nothing is known
-beforehand, the result of the coarse levels stays; it costs a tenth of the whole.
-
-Brightness: where texture is weak, matches follow the gradient of brightness, and if this gradient differs between the
-images, they are wrong. The logarithm of the ratio, left over right (vignetting, exposure), is a polynomial in the
-coordinates of the right image. It is fitted to the grey values of matches of a coarse level. Before there are matches,
-it is guessed from the grey values of each image as a whole, since both show nearly the same scene; the guess is used
-only if it gives more matches.
+"""Coarse levels of a pair, step by step: brightness, prior disparities, alignment by a plane or keypoints, focus.
 
 Focus: where one image shows less detail, distances of features and residuals of the refinement measure the blur and not
 the displacement. The finest level then sees the sharper image through a Gaussian that leaves it as much.
@@ -18,212 +7,26 @@ the displacement. The finest level then sees the sharper image through a Gaussia
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.errors import InputError
 from rille.stages.geometry.projection import product
 from rille.stages.geometry.scale import other_size
-from rille.stages.hfvm import epipolar, plane
-from rille.stages.hfvm.image import Grey, Image, Shape, Window, thinned
+from rille.stages.hfvm import plane
+from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, guess, levelled, ratio_of_matches
+from rille.stages.hfvm.image import Image, thinned
 from rille.stages.hfvm.level import FREE_BAND, PyramidPair, State, descend, sample, textured
 from rille.stages.hfvm.native.problem import Map
-from rille.stages.numeric.least_squares import irls
-from rille.stages.numeric.robust import cauchy
-
-
-@dataclass(frozen=True)
-class PriorDisparities:
-    """Column and row displacements (row, col) of level 0, float32 pixels, NaN unknown."""
-
-    u: AnyArray
-    v: AnyArray
-
-    def halved(self) -> PriorDisparities:
-        """The prior at half the resolution."""
-        return PriorDisparities(0.5 * self.u[::2, ::2], 0.5 * self.v[::2, ::2])
-
-
-def known_beforehand(prior: tuple[AnyArray, AnyArray] | None, shape: tuple[int, ...]) -> PriorDisparities | None:
-    """Prior of two arrays; what is not finite or absurdly great counts as unknown.
-
-    Raises
-    ------
-    InputError
-        An array has not the left image's shape.
-    """
-    if prior is None:
-        return None
-    u, v = (np.asarray(a, dtype=np.float32) for a in prior)
-    if u.shape != shape or v.shape != shape:
-        raise InputError(
-            "RIL-348",
-            f"prior disparities {u.shape} and {v.shape} and the left image {shape} differ",
-            remedy="give disparities of the left image, one a pixel",
-        )
-    return _bounded(u, v)
-
-
-def _bounded(u: AnyArray, v: AnyArray) -> PriorDisparities:
-    # Displacements of a level are 16-bit and doubled from level to level. NaN is not less, and so unknown as well.
-    known = np.maximum(np.abs(u), np.abs(v)) < 16000
-    return PriorDisparities(np.where(known, u, np.float32(np.nan)), np.where(known, v, np.float32(np.nan)))
-
-
-def impose(images: PyramidPair, state: State, prior: PriorDisparities | None) -> State:
-    """State of the same level with the prior's displacements in both directions where they are known.
-
-    At level 0 (images too small for coarser ones) the whole range has been searched, and nothing is imposed.
-    """
-    if prior is None or state.level == 0:
-        return state
-    u, v, known = _coarse(prior, state.level, state.left.u.shape)
-    left = _overlay(state.left, u, v, known)
-    near = (state.near_sign or -1.0) * np.asarray(v if state.upright else u, np.float64)
-    ru, rv, hit = _reverse(u, v, known, state.right.u.shape, near)
-    right = _overlay(state.right, ru, rv, hit)
-    masks = [image.layers[state.level].valid != 0 for image in (images.left, images.right)]
-    left_ok, right_ok = (state.left_ok | known) & masks[0], (state.right_ok | hit) & masks[1]
-    return replace(state, left=left, right=right, left_ok=left_ok, right_ok=right_ok)
-
-
-def _coarse(
-    prior: PriorDisparities, level: int, shape: tuple[int, ...]
-) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
-    """Displacements of a level: medians of the known ones of each block, whole pixels of that level."""
-    side = 2**level
-    maps = []
-    for a in (prior.u, prior.v):
-        padded = np.full((shape[0] * side, shape[1] * side), np.nan, np.float32)
-        padded[: a.shape[0], : a.shape[1]] = a
-        blocks = padded.reshape(shape[0], side, shape[1], side).swapaxes(1, 2).reshape(*shape, side * side)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # blocks without any are NaN, as they should be
-            # No means: of a block across a depth edge they lie on neither surface.
-            maps.append(np.nanmedian(blocks, axis=2) / side)
-    known = np.isfinite(maps[0]) & np.isfinite(maps[1])
-    u, v = (np.rint(np.where(known, a, 0.0)).astype(np.int16) for a in maps)
-    return u, v, known
-
-
-def _reverse(
-    u: AnyArray, v: AnyArray, known: NDArray[np.bool_], shape: tuple[int, ...], near: AnyArray
-) -> tuple[AnyArray, AnyArray, NDArray[np.bool_]]:
-    """Displacements of the right image: each left one at its far end; of several the nearest thing's, by ``near``."""
-    y, x = np.nonzero(known)
-    # From far to near, since of several that meet at a pixel the last one stays: the one that hides the others.
-    order = np.argsort(near[y, x], kind="stable")
-    y, x = y[order], x[order]
-    xr, yr = x + u[y, x].astype(np.intp), y + v[y, x].astype(np.intp)
-    inside = (xr >= 0) & (xr < shape[1]) & (yr >= 0) & (yr < shape[0])
-    y, x, yr, xr = y[inside], x[inside], yr[inside], xr[inside]
-    ru, rv, hit = np.zeros(shape, np.int16), np.zeros(shape, np.int16), np.zeros(shape, bool)
-    ru[yr, xr], rv[yr, xr], hit[yr, xr] = -u[y, x], -v[y, x], True
-    return ru, rv, hit
-
-
-def _overlay(m: Map, u: AnyArray, v: AnyArray, known: NDArray[np.bool_]) -> Map:
-    return Map(np.where(known, u, m.u), np.where(known, v, m.v))
-
-
-MIN_FIT_PIXELS = 100
-"""Pixels that a polynomial needs at least."""
-
-MIN_GREY, MAX_GREY = 4.0, 250.0
-"""Grey levels between which pixels are used for the ratio."""
-
-MIN_LOG_RATIO = 0.1
-"""Logarithm of the ratio that must be reached somewhere in the image for it to be corrected."""
-
-
-def terms(x: AnyArray, y: AnyArray, level: int, shape: Shape) -> Floats:
-    """Terms (7, ...) of the polynomial at pixels of a level of an image of ``shape`` (level 0).
-
-    1, x, y, x^2, xy, y^2 and (x^2 + y^2)^2, in half sides from the middle.
-    """
-    k = 2.0**level
-    # Counted from the image's outer corner, where pixel x of any level has its centre at k (x + 0.5).
-    p = ((x + 0.5) * k) / (0.5 * shape[1]) - 1.0
-    q = ((y + 0.5) * k) / (0.5 * shape[0]) - 1.0
-    p, q = np.broadcast_arrays(p, q)
-    return np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, (p * p + q * q) ** 2])
-
-
-def levelled(image: Image, ratio: Floats | None) -> Image:
-    """The image with the ratio corrected; None: the image as it is."""
-    if ratio is None:
-        return image
-    # Noise is multiplied as the middle of the image is.
-    return image.changed(partial(_brighter, ratio, image.shapes[0]), image.noise * float(np.exp(ratio[0])))
-
-
-def _brighter(g: Floats, shape: Shape, read: Callable[[Window], Grey], level: int, window: Window) -> Grey:
-    grey, mask = read(window)
-    y, x = np.arange(window.y0, window.y1)[:, None], np.arange(window.x0, window.x1)
-    p, q = terms(x, 0 * x, level, shape)[1], terms(0 * y, y, level, shape)[2]
-    # Horner's form, a row of terms each: seven planes of the whole image would take longer than all else.
-    radial = (p * p + q * q).astype(np.float32)
-    log = (g[0] + p * (g[1] + g[3] * p)).astype(np.float32) + (q * (g[2] + g[5] * q)).astype(np.float32)
-    log += np.float32(g[4]) * (p.astype(np.float32) * q.astype(np.float32)) + np.float32(g[6]) * radial * radial
-    return grey * np.exp(log), mask
-
-
-def guess(left: Image, right: Image, level: int) -> Floats:
-    """Ratio of the polynomials that either image's own brightness follows at a level; zeros of dark or tiny images."""
-    polynomials = []
-    for image in (left, right):
-        layer = image.layers[level]
-        y, x = np.nonzero((layer.valid != 0) & (layer.grey > MIN_GREY))
-        if len(y) < MIN_FIT_PIXELS:
-            return np.zeros(7)
-        polynomials.append(_fit(terms(x, y, level, image.shapes[0]), np.log(layer.grey[y, x].astype(np.float64))))
-    return polynomials[0] - polynomials[1]
-
-
-def ratio_of_matches(left: Image, right: Image, state: State) -> Floats | None:
-    """Ratio of the grey values of the consistent matches of a level; None where they are too few."""
-    y, x = thinned(state.left_ok, 4000)
-    p, q = x + state.left.u[y, x].astype(np.int64), y + state.left.v[y, x].astype(np.int64)
-    a, b = left.layers[state.level].grey[y, x], right.layers[state.level].grey[q, p]
-    # At MIN_GREY one grey level is a quarter of the value, five times the least scatter; at the top values are clipped.
-    good = (np.minimum(a, b) > MIN_GREY) & (np.maximum(a, b) < MAX_GREY)
-    if np.count_nonzero(good) < MIN_FIT_PIXELS:
-        return None
-    # Places of the right image, since that is the one to be multiplied.
-    basis = terms(p[good], q[good], state.level, right.shapes[0])
-    return _fit(basis, np.log(a[good].astype(np.float64) / b[good]))
-
-
-def _fit(basis: Floats, target: Floats) -> Floats:
-    """Factors of the terms, by Cauchy weights; weakly held at zero."""
-
-    def weigh(off: AnyArray) -> AnyArray:
-        # 1.5 times the median magnitude is about the standard deviation of normal scatter.
-        # 0.05: least scatter of the logarithms of matched grey values.
-        return cauchy(off, max(0.05, 1.5 * epipolar.typical(off)))
-
-    # Terms that the matches leave open stay near zero instead of growing outside of them.
-    hold = 1e-3 * target.size * np.eye(len(basis))
-    return irls(basis.T, target, weigh, hold, np.zeros(len(basis)), rounds=8)
-
-
-def greatest(ratio: Floats) -> float:
-    """Greatest logarithm, either way, in the image."""
-    side = np.linspace(0, 1, 9)
-    # Nine places from edge to edge of an image of 9 x 9: terms are in half sides, so that any size stands for all.
-    return float(np.abs(np.tensordot(ratio, terms(side * 9 - 0.5, (side * 9 - 0.5)[:, None], 0, (9, 9)), 1)).max())
-
+from rille.stages.hfvm.prior import PriorDisparities, bounded, impose
 
 COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
@@ -337,7 +140,7 @@ def known(coarse: Coarse) -> Coarse:
     prior, h = coarse.prior, coarse.alignment
     if prior is not None and h is not None:
         # Points near the horizon of the plane get displacements greater than the prior's.
-        prior = _bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
+        prior = bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
     return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
 

@@ -9,7 +9,7 @@ from raising import raises
 from rille.stages.calibration.doubt import swapped
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
-from rille.stages.hfvm import coarse
+from rille.stages.hfvm import plane, prior
 from rille.stages.hfvm.finest import isolated
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
@@ -219,8 +219,8 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
     # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
     ends = np.full((64, 64), 15900.0, np.float32)
-    away = np.linalg.inv(coarse.plane.to_original(horizon, ends.shape))
-    led, near = (coarse._bounded(*coarse.plane.carried(away, u, 0 * u)) for u in (ends, 0 * ends))
+    away = np.linalg.inv(plane.to_original(horizon, ends.shape))
+    led, near = (prior.bounded(*plane.carried(away, u, 0 * u)) for u in (ends, 0 * ends))
     np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), 16000)
     assert np.isfinite(near.u).all()
 
