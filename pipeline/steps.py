@@ -252,8 +252,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Warns
     -----
     UserWarning
-        Hardly a pixel matches, most have no texture, left and right seem swapped, one image is blurred beside the other
-        one, or samples of 16 bits use a small part of their range and are spread.
+        Hardly a pixel matches, most have no texture, one image is blurred beside the other one, or samples of 16 bits
+        use a small part of their range and are spread.
 
     Examples
     --------

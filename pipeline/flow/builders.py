@@ -19,7 +19,6 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
 from rille.stages.calibration.calibration import calibration_stage
-from rille.stages.calibration.mirror_check import mirror_check_stage
 from rille.stages.calibration.orientation import orientation_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
@@ -28,7 +27,6 @@ from rille.stages.core.declare import F, NoParams, Params, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import (
     CalibrationFacts,
-    MirrorFacts,
     OrientationFacts,
     RigFacts,
     SwapFacts,
@@ -255,11 +253,6 @@ class Builder:
         """Whether the images of a pair are exchanged."""
         images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
-
-    def mirrored(self, pair: int) -> Handle[MirrorFacts]:
-        """Whether one image of a pair is mirrored."""
-        images = {camera: self.image(pair, camera) for camera in CAMERAS}
-        return self.node(mirror_check_stage, f"mirror_check/{pair}", **images, rig=self.given_rig)
 
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
         """Which right images, of those of some frames about each pair, are of the time of the left ones."""
