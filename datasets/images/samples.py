@@ -1,4 +1,4 @@
-"""Some images of a sequence, looked at when it is opened: range of samples, mosaics, noise, orientations."""
+"""Some images of a sequence, looked at when it is opened: range of samples, mosaics, fields, orientations."""
 
 from __future__ import annotations
 
@@ -57,6 +57,9 @@ def examined(sequence: Sequence) -> Sequence:
     for camera in mosaics:
         text = f"{camera} images are a mosaic of colours (Bayer): convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
         lines.append(warning("RIL-826", text))
+    for camera in [camera for camera, of in images.items() if any(map(interlaced, of))]:
+        text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
+        lines.append(warning("RIL-832", text))
     for camera, share in [(camera, fixed_pattern(of)) for camera, of in images.items() if camera not in mosaics]:
         # 0.2: in images of scenes that move at most 0.03, by a pattern of 8 grey levels in 256 0.25, of 25 0.7.
         if share > 0.2:
@@ -124,6 +127,18 @@ def mosaic(image: AnyArray) -> bool:
     # In ordinary images at most 0.01 of the blocks show a mosaic, in mosaics at least 0.87.
     diagonals, rows_differ, columns_differ = differ(a + d - b - c), differ(a + b - c - d), differ(a + c - b - d)
     return bool((diagonals | (rows_differ & columns_differ)).mean() > 0.4)
+
+
+def interlaced(image: AnyArray) -> bool:
+    """Whether every other row of a grey image (row, col) fits the row between less than the next but one, as where two
+    fields show something that moved; columns of a scene, and both in a mosaic, tell it from that."""
+
+    def ratio(rows: AnyArray) -> float:
+        """Differences of rows two apart over those of neighbours, 1.2 to 2 in ordinary images, 1 in mere noise."""
+        return float(np.abs(rows[2:] - rows[:-2]).mean() / max(np.abs(rows[1:] - rows[:-1]).mean(), 1e-6))
+
+    grey = image.astype(np.float32)
+    return min(grey.shape) > 2 * BLOCK and ratio(grey) < 0.9 * min(1.0, ratio(grey.T))
 
 
 def fixed_pattern(images: list[AnyArray]) -> float:

@@ -2,7 +2,8 @@
 
 The crosscheck's poses are laid on ours by one rotation and translation, without scale (each unbroken piece by its
 own); what remains is the disagreement. It does not say who is wrong, but where the two part, one of them is. What both
-share, the given calibration, it cannot judge: a wrong baseline stretches both alike.
+share, the given calibration, it cannot judge: a wrong baseline stretches both alike. But a frame whose two images fit
+the given rig worse than those of all others is flagged as well, even where its pose is right by the left image alone.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ REASONS: Mapping[str, Reason] = {
     "angle": Reason(2, "rotation", math.radians(0.05)),
     "step_distance": Reason(4, "motion since the frame before", 1e-9),
     "step_angle": Reason(8, "rotation since the frame before", math.radians(0.05)),
+    "line_distance": Reason(16, "left and right image do not fit the rig", 1.0),
 }
 """Reasons by the array (frame,) that they are judged by. Less than 1e-9 m is rounding; 0.05 degrees are a pixel at a
 focal length of 1100 pixels."""
@@ -151,7 +153,8 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
         Array("angle", ("frame",), "float64", "rad", "disagreement in rotation", "nan"),
         Array("step_distance", ("frame",), "float64", "m", "disagreement in the motion since the frame before", "nan"),
         Array("step_angle", ("frame",), "float64", "rad", "the same, rotation", "nan"),
-        Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 and 8 those of a step"),
+        Array("line_distance", ("frame",), "float64", "px", "median of the matches from their epipolar lines", "nan"),
+        Array("flagged", ("frame",), "uint8", "1", "bits: 1 position, 2 rotation, 4 and 8 those of a step, 16 rig"),
     ],
 )
 def agreement_stage(
@@ -159,10 +162,13 @@ def agreement_stage(
 ) -> Bundle[AgreementFacts]:
     """Trajectory against the crosscheck's."""
     frames, given, ours = trajectory.meta["frames"], crosscheck.meta["frames"], np.asarray(trajectory["poses"])
-    theirs, numbers = (rigid.by_frame(np.asarray(crosscheck[name]), given, frames) for name in ("poses", "piece"))
+    theirs, numbers, lines = (
+        rigid.by_frame(np.asarray(crosscheck[name]), given, frames) for name in ("poses", "piece", "line_distance")
+    )
     own = np.asarray(trajectory.arrays.get("piece", np.zeros(len(frames))), np.int64)
     piece = unbroken(np.nan_to_num(numbers, nan=-1).astype(np.int64), own)
     arrays, scale, scaled = compare(ours, theirs, piece)
+    arrays["line_distance"] = lines
     flags, limits = flag(arrays)
     compared = np.isfinite(arrays["distance"])
     # Our pieces lie in frames of their own: from one to the next there is no way.
@@ -192,7 +198,9 @@ def agreement_stage(
         "metrics": figures,
         "rule": f"disagreement above the median by more than {MIN_SIGMAS:g} robust standard deviations "
         f"(1.4826 MAD), and above {MIN_RATIO:g} medians; in position, rotation (from "
-        f"{math.degrees(REASONS['angle'].least):g}° on), or the motion since the frame before",
+        f"{math.degrees(REASONS['angle'].least):g}° on), or the "
+        "motion since the frame before; or matches of left and right as far "
+        f"(from {REASONS['line_distance'].least:g} px on) from their epipolar lines",
         "limits": {n: v if v is None or "angle" not in n else math.degrees(v) for n, v in limits.items()},
         "flagged": [
             {"frame": f, "why": [reason.words for reason in REASONS.values() if bits & reason.bit]}

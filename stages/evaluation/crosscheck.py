@@ -23,6 +23,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.facts.evaluation import WindowFacts
+from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import PIXEL_CENTRE, match
 
@@ -157,6 +158,18 @@ def _stereo_points(features: Sequence[Bundle], verified: Verified) -> dict[int, 
     }
 
 
+def _line_distances(rig: Rig, frames: int, stereo: Mapping[int, tuple[Floats, Floats]]) -> Floats:
+    """Median distance (frame,), px, of the matches of left and right from their epipolar lines under the given rig.
+
+    NaN where the two do not match. Verified are matches by any motion between two cameras: an image that has slipped in
+    its row is no outlier there, and registration does without it.
+    """
+    out = np.full(frames, np.nan)
+    for left, points in stereo.items():
+        out[left // 2] = np.median(np.abs(distances(rig, np.zeros(5), *points)[0]))
+    return out
+
+
 def _near(rig: Rig, left: Floats, right: Floats) -> int:
     """Number of the matches whose rays meet under an angle at which COLMAP keeps the point."""
     rays = rig.left.rays(left), rig.right.rays(right) @ rig.T_right_left.rotation
@@ -225,6 +238,7 @@ def _read(model: Any, frames: int) -> Floats:
     version=3,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "window"),
+        Array("line_distance", ("frame",), "float64", "px", "median of the matches from their epipolar lines", "nan"),
     ],
     memory=Memory(fixed=150e6, factor=20.0, result=0.0, lower=("crosscheck.window",)),
 )
@@ -252,4 +266,4 @@ def crosscheck_stage(
         count = np.median([len(f["points"]) for f in features])
         reason = f"no two images match (median {count:.0f} features an image)"
     meta: WindowFacts = {"frames": list(frames), "reprojection_px": reprojection, "reason": reason}
-    return Bundle({"poses": poses}, meta)
+    return Bundle({"poses": poses, "line_distance": _line_distances(rig, len(frames), stereo)}, meta)

@@ -69,6 +69,7 @@ def _fade(earlier: Floats, later: Floats) -> Floats:
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "piece"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),
+        Array("line_distance", ("frame",), "float64", "px", "median of the matches from their epipolar lines", "nan"),
     ],
 )
 def crosscheck_join_stage(
@@ -76,6 +77,10 @@ def crosscheck_join_stage(
 ) -> Bundle[JoinFacts]:
     """Windows of the crosscheck to one trajectory."""
     chained, piece = join(frames, [(b.meta["frames"], np.asarray(b["poses"])) for b in windows])
+    # The same of each window that has the frame.
+    line = np.full(len(frames), np.nan)
+    for b in windows:
+        line = np.fmax(line, by_frame(np.asarray(b["line_distance"]), b.meta["frames"], frames))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max(initial=-1)) + 1)]
     longest = int(np.argmax([len(one) for one in pieces])) if pieces else -1
     meta: JoinFacts = {
@@ -84,4 +89,4 @@ def crosscheck_join_stage(
         "pieces": pieces,
         "reasons": [b.meta["reason"] for b in windows if b.meta["reason"]],
     }
-    return Bundle({"poses": chained, "piece": piece}, meta)
+    return Bundle({"poses": chained, "piece": piece, "line_distance": line}, meta)

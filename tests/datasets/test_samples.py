@@ -9,7 +9,7 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.samples import fixed_pattern, mosaic
+from rille.datasets.images.samples import fixed_pattern, interlaced, mosaic
 from rille.datasets.registry import open_sequence
 
 
@@ -57,6 +57,29 @@ def test_a_mosaic_is_said_when_it_is_opened(tmp_path):
     for k, image in enumerate(sorted(tmp_path.glob("*/*.png"))):
         cv2.imwrite(str(image), filtered(coloured(k), "rggb"))
     assert sum("RIL-826" in line for line in open_sequence(str(path)).warnings) == 2
+
+
+def of_two_moments(image, motion):
+    """Every other row of an image is of a moment at which everything has moved by (column, row)."""
+    later = np.roll(image, motion[::-1], (0, 1))
+    return np.where(np.indices(image.shape)[0] % 2, later, image)
+
+
+@pytest.mark.parametrize("motion", [(4, 0), (0, 4), (9, 3)])
+def test_rows_of_two_moments_are_told_from_scenes(motion):
+    image = cv2.GaussianBlur(np.random.default_rng(4).random((160, 192)).astype(np.float32) * 255, (0, 0), 1.5)
+    assert interlaced(of_two_moments(image, motion))
+    noise = np.random.default_rng(1).integers(0, 255, (200, 200))
+    for other in (image, of_two_moments(image.T, motion).T, noise, filtered(coloured(), "rggb"), np.zeros((200, 200))):
+        assert not interlaced(other)
+
+
+def test_rows_of_two_moments_are_said_when_they_are_opened(tmp_path):
+    path = write_sequence(tmp_path, frames=2)
+    for image in sorted(tmp_path.glob("*/*.png")):
+        grey = cv2.cvtColor(cv2.GaussianBlur(coloured(), (0, 0), 1.5), cv2.COLOR_RGB2GRAY)
+        cv2.imwrite(str(image), of_two_moments(grey, (5, 0)))
+    assert sum("RIL-832" in line for line in open_sequence(str(path)).warnings) == 2
 
 
 @pytest.mark.parametrize("across", [(1, 192), (160, 1), (160, 192)], ids=["columns", "rows", "pixels"])

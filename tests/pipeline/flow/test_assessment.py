@@ -15,7 +15,8 @@ def test_the_other_program_s_longest_piece_is_judged(split: int) -> None:
     poses[:, 2, 3] = np.arange(12.0)
     frames = list(range(12))
     windows = [
-        Bundle({"poses": poses[a:b]}, {"frames": frames[a:b], "reason": ""}) for a, b in ((0, split), (split, 12))
+        Bundle({"poses": poses[a:b], "line_distance": np.zeros(b - a)}, {"frames": frames[a:b], "reason": ""})
+        for a, b in ((0, split), (split, 12))
     ]
     joined = crosscheck_join.crosscheck_join_stage.run(NoParams(), {"frames": frames}, {"windows": windows})
     known = {"truth": poses.reshape(12, 12).tolist(), "frames": frames}

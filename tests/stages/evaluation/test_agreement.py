@@ -40,11 +40,14 @@ def moved(poses: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> n
     return compose(np.column_stack([rotation, translation]), poses)
 
 
-def run(ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None) -> Bundle:
+def run(
+    ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None, lines: np.ndarray | None = None
+) -> Bundle:
     piece = np.where(np.isfinite(theirs[:, 0, 0]), 0, -1) if piece is None else piece
     frames = list(range(10, 10 + len(ours)))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
     arrays = {"poses": theirs, "piece": piece.astype(np.int16)}
+    arrays["line_distance"] = np.full(len(ours), 0.2) if lines is None else lines
     other = Bundle(arrays, {"frames": frames, "pieces": pieces})
     out = agreement_stage.run(
         NoParams(), {}, {"trajectory": Bundle({"poses": ours}, {"frames": frames}), "crosscheck": other}
@@ -88,6 +91,15 @@ def test_one_turned_frame_is_flagged_by_rotation_alone() -> None:
     assert math.degrees(out["angle"][12]) == pytest.approx(math.degrees(0.05), abs=0.3)
 
 
+def test_a_frame_whose_images_do_not_fit_the_rig_is_flagged_although_its_pose_is_right() -> None:
+    ours = drive(20)
+    lines = np.where(np.arange(20) == 7, 5.0, 0.3)
+    out = run(ours, ours, lines=lines)
+    assert out.meta["flagged"] == [{"frame": 17, "why": ["left and right image do not fit the rig"]}]
+    # Of a rig that is wrong all over, all are far off: that is no reason for a single frame.
+    assert run(ours, ours, lines=6.0 + 0.1 * RNG(0).normal(size=20)).meta["flagged"] == []
+
+
 def test_noise_alone_is_not_flagged() -> None:
     ours = drive(60)
     assert [len(run(ours, noisy(ours, seed)).meta["flagged"]) for seed in range(5)] == [0] * 5
@@ -101,6 +113,7 @@ def test_the_limit_by_hand() -> None:
         "angle": 1e-6 * values,
         "step_distance": np.full(5, 3.0),
         "step_angle": values * np.nan,
+        "line_distance": 0.1 * values,
     }
     flags, limits = flag(arrays)
     assert limits["distance"] == pytest.approx(9.413)
@@ -213,7 +226,7 @@ def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     ours[10:] = moved(true[10:], true[10, :, :3].T, -true[10, :, :3].T @ true[10, :, 3])  # begins at its own origin
     frames = list(range(20))
     given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
-    arrays = {"poses": true, "piece": np.zeros(20, np.int16)}
+    arrays = {"poses": true, "piece": np.zeros(20, np.int16), "line_distance": np.zeros(20)}
     other = Bundle(arrays, {"frames": frames, "pieces": [frames]})
     metrics = agreement_stage.run(NoParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]
     assert metrics["rmse"]["value"] == pytest.approx(0.0, abs=1e-9)

@@ -90,6 +90,7 @@ def test_poses_are_metric_and_repeat_bit_by_bit(scene: Any) -> None:
         np.testing.assert_array_equal(array, again[name])
     assert out.meta == again.meta
     assert posed(out["poses"]).all()
+    assert out["line_distance"].max() < 0.5
     np.testing.assert_allclose(out["poses"][0], np.eye(3, 4), atol=1e-12)
     true = np.array([(poses[0].inverse() @ T).matrix34 for T in poses])
     # the rig sees depth at 4 m to 4^2 / (300 * 0.2) m a pixel: 27 mm for features of 0.1 px, 1.5 mm over 300 of them
@@ -154,6 +155,17 @@ def test_a_frame_that_fits_nowhere_is_listed_and_the_rest_stays(scene: Any) -> N
     left[2], right[2] = bundle(noise[0]), bundle(noise[1])
     out = run({"left": left, "right": right}, [0, 1, 2, 3])
     assert posed(out["poses"]).tolist() == [True, True, False, True]
+    assert np.isnan(out["line_distance"][2])
+
+
+def test_an_image_that_has_slipped_in_its_row_is_far_from_the_epipolar_lines(scene: Any) -> None:
+    """By 6 pixels; the frame's pose is right all the same, by the other images."""
+    poses, inputs = scene
+    right = list(inputs["right"])
+    right[2] = bundle(np.roll(render(RIG.T_right_left @ poses[2].inverse()), 6, axis=0))
+    out = run({"left": inputs["left"], "right": right}, [0, 1, 2, 3])
+    assert out["line_distance"][2] == pytest.approx(6.0, abs=0.3)
+    assert np.delete(out["line_distance"], 2).max() < 0.5
 
 
 @pytest.mark.parametrize("kind", ["blank", "noise"])

@@ -30,7 +30,8 @@ def cut(poses: np.ndarray, frames: list[int], seed: int) -> tuple[list[int], np.
 
 def bundle(part: tuple[list[int], np.ndarray]) -> Bundle:
     reason = "" if posed(part[1]).any() else "no two images match"
-    return Bundle({"poses": part[1]}, {"frames": part[0], "reason": reason})
+    lines = np.array(part[0]) / 10
+    return Bundle({"poses": part[1], "line_distance": lines}, {"frames": part[0], "reason": reason})
 
 
 def test_windows_of_exact_poses_make_the_whole() -> None:
@@ -68,6 +69,7 @@ def test_a_broken_chain_names_its_pieces_and_keeps_the_longest() -> None:
     assert out.meta["main"] == 1
     assert posed(out["poses"]).tolist() == [True] * 7 + [False] + [True] * 4
     assert out["piece"].tolist() == [0] * 4 + [1] * 3 + [-1] + [1] * 4
+    np.testing.assert_allclose(out["line_distance"], np.arange(12) / 10)
 
 
 def test_no_window_with_a_model_is_a_fact() -> None:
