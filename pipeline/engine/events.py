@@ -14,7 +14,7 @@ from typing import Any
 
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.runtime.atomic import named
-from rille.pipeline.engine.spec import each
+from rille.pipeline.engine.spec import map_ports
 
 
 class Ledger:
@@ -33,7 +33,7 @@ class Ledger:
             "label": handle.label,
             "stage": handle.stage,
             "status": handle.status,
-            "inputs": each(lambda h: h.label, handle.inputs),
+            "inputs": map_ports(lambda h: h.label, handle.inputs),
             "reason": handle.reason,
             "key": handle.key,
             "digest": handle.ref and handle.ref.digest,

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Generic, NamedTuple, cast
 
-from rille.pipeline.engine.spec import Refs, Spec, each, flat
+from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import F, Params, Stage
 
@@ -86,11 +86,11 @@ class Handle(Generic[F]):
 
     def upstream(self) -> list[Handle]:
         """Handles of all inputs, in order of the ports."""
-        return flat(self.inputs)
+        return flatten_ports(self.inputs)
 
     def refs(self) -> Refs:
         """References of all inputs by port; call it when they are done."""
-        return each(_ref, self.inputs)
+        return map_ports(_ref, self.inputs)
 
 
 class MissingError(Exception):
@@ -157,7 +157,7 @@ def first_label(label: str) -> str:
 
 @dataclass
 class Graph:
-    """Nodes in order of creation, and flows that wait for some of them (``expansions``).
+    """Nodes in order of creation, and flows that wait for some of them (``waiting``).
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class Graph:
         by them.
     last : called once nothing else will be laid out: adds what reads all of it.
     cut : what of it is wanted; None: all.
-    asked : numbers of the nodes that a cut graph computes, as far as it is known.
+    needed : numbers of the nodes that a cut graph computes, as far as it is known.
     outdated : numbers of nodes of a calibration that has been corrected since; one that is laid out again counts again.
     unfinished : flows that wait for something: where a plan ends with some, it does not know all tasks.
     """
@@ -173,10 +173,10 @@ class Graph:
     sequence: str = ""
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
-    expansions: list[Waiting] = field(default_factory=list)
+    waiting: list[Waiting] = field(default_factory=list)
     last: Callable[[], None] | None = None
     cut: Cut | None = None
-    asked: set[int] = field(default_factory=set)
+    needed: set[int] = field(default_factory=set)
     unfinished: int = 0
     outdated: set[int] = field(default_factory=set)
     _labels: dict[str, Handle] = field(default_factory=dict)
@@ -259,7 +259,7 @@ class Graph:
         except MissingError as error:
             self.unfinished -= 1
             # The flow never goes on; the end of the run names the tasks that it waited for.
-            self.expansions.append(Waiting(error.handles, lambda *_: None, holes=False))
+            self.waiting.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
         if wanted is None:
             self.unfinished -= 1
@@ -275,7 +275,7 @@ class Graph:
             else:
                 self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        self.expansions.append(Waiting(handles, resume, holes=True))
+        self.waiting.append(Waiting(handles, resume, holes=True))
 
 
 _NONE: dict[str, Any] = {}

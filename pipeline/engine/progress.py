@@ -55,7 +55,7 @@ class Progress:
         """Nodes that are known and wanted by now."""
         if self.graph is None:
             return 0
-        return len(self.graph.nodes if self.graph.cut is None else self.graph.asked)
+        return len(self.graph.nodes if self.graph.cut is None else self.graph.needed)
 
 
 class Lines(Progress):

@@ -38,12 +38,12 @@ from rille.pipeline.engine.graph import Graph, Handle, Waiting
 from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
-from rille.pipeline.engine.spec import Refs, each, key_of, recipe
+from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, code_changed
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MISSING = ("failed", "skipped", "planned")
@@ -153,7 +153,7 @@ class _Run:
     Attributes
     ----------
     taken : nodes of the graph that were taken up, in order.
-    again : numbers of nodes to be taken up again, the least first.
+    retries : numbers of nodes to be taken up again, the least first.
     in_flight : with the workers, or in ``calls``.
     calls : what the workers are given next, all at once.
     suspects : numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``.
@@ -170,7 +170,7 @@ class _Run:
         self.estimates, self.largest = memory.Estimates(), 0.0
         self.stopped = ""
         self.taken = 0
-        self.again: list[int] = []
+        self.retries: list[int] = []
         self.in_flight: dict[int, Handle] = {}
         self.calls: list[Call] = []
         self.suspects: list[int] = []
@@ -179,7 +179,7 @@ class _Run:
         self.before: dict[int, str] = {}
         self.history = provenance.History(store, graph.sequence, graph.choice)
         self.seen = 0
-        self._ask()
+        self._mark_needed()
 
     def go(self) -> Result:
         begin = time.perf_counter()
@@ -235,20 +235,20 @@ class _Run:
                 if number in self.in_flight:  # not if the run was stopped by one before
                     self._land(self.in_flight.pop(number), ended)
 
-    def _ask(self) -> None:
+    def _mark_needed(self) -> None:
         """Find what a cut graph asks for by now: wanted nodes, what flows wait for, and all that these need."""
         cut, nodes = self.graph.cut, self.graph.nodes
         if cut is None:
             return
         wanted = [h for h in nodes[self.seen :] if cut.wants(h)]
-        wanted += [h for waiting in self.graph.expansions for h in waiting.handles]
+        wanted += [h for waiting in self.graph.waiting for h in waiting.handles]
         self.seen = len(nodes)
         while wanted:
             handle = wanted.pop()
-            if handle.index not in self.graph.asked:
-                self.graph.asked.add(handle.index)
+            if handle.index not in self.graph.needed:
+                self.graph.needed.add(handle.index)
                 if handle.index < self.taken:
-                    heapq.heappush(self.again, handle.index)
+                    heapq.heappush(self.retries, handle.index)
                 wanted += handle.upstream()
 
     # -- what becomes of a node ---------------------------------------------------------------------------------
@@ -265,11 +265,11 @@ class _Run:
             number = heapq.heappop(self.suspects)
             self.alone.add(number)
             self._settle(self.graph.nodes[number])
-        elif self.again:
-            self._settle(self.graph.nodes[heapq.heappop(self.again)])
+        elif self.retries:
+            self._settle(self.graph.nodes[heapq.heappop(self.retries)])
         elif self.taken < len(self.graph.nodes):
             self.taken += 1
-            if self.graph.cut is None or self.taken - 1 in self.graph.asked:
+            if self.graph.cut is None or self.taken - 1 in self.graph.needed:
                 self._settle(self.graph.nodes[self.taken - 1])
         else:
             return False
@@ -315,7 +315,7 @@ class _Run:
             self.largest = needs
             if self.workers is not None:
                 self.workers.scale(self.budget.workers(needs))
-        given, force = each(_given, handle.inputs), handle.stage in self.force
+        given, force = map_ports(_given, handle.inputs), handle.stage in self.force
         self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
 
@@ -366,7 +366,7 @@ class _Run:
         if isinstance(ended, Outcome):
             self._succeed(handle, ended)
         elif isinstance(ended, NotBegun):
-            heapq.heappush(self.again, handle.index)
+            heapq.heappush(self.retries, handle.index)
         elif isinstance(ended, Died) and handle.index not in self.alone:
             heapq.heappush(self.suspects, handle.index)
         elif isinstance(ended, Died):
@@ -414,8 +414,8 @@ class _Run:
                 self.before[source.index] = source.ref.digest
                 source.reason = "its artifact was found damaged, or gone, when it was read"
                 source.ref, source.status = None, "pending"
-                heapq.heappush(self.again, source.index)
-        heapq.heappush(self.again, handle.index)
+                heapq.heappush(self.retries, source.index)
+        heapq.heappush(self.retries, handle.index)
         return True
 
     def _fail(self, handle: Handle, failed: Failed) -> None:
@@ -442,19 +442,19 @@ class _Run:
         """Go on with the first flow whose handles are done, or lay out what comes last; whether there was such."""
         if self.stopped or self.suspects:
             return False
-        for i, waiting in enumerate(self.graph.expansions):
+        for i, waiting in enumerate(self.graph.waiting):
             lost = ("failed", "skipped") if waiting.holes else ()
             if all(h.done or h.earlier or h.status in lost for h in waiting.handles):
-                del self.graph.expansions[i]
+                del self.graph.waiting[i]
                 self._expand(waiting)
-                self._ask()
+                self._mark_needed()
                 return True
         last = self.graph.last
-        if last is None or (self.graph.expansions and self.in_flight):
+        if last is None or (self.graph.waiting and self.in_flight):
             return False
         self.graph.last = None
         last()
-        self._ask()
+        self._mark_needed()
         return True
 
     def _expand(self, waiting: Waiting) -> None:
@@ -476,8 +476,8 @@ class _Run:
         """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for, and
         those of an outdated calibration that failed."""
         if self.graph.cut is not None:
-            self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.asked)
-            self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.asked]
+            self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.needed)
+            self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.needed]
         for handle in self.graph.nodes:
             if handle.status == "pending":
                 lost = next((h for h in handle.upstream() if h.status in MISSING), None)
@@ -489,7 +489,7 @@ class _Run:
         gone = {h for h in self.graph.nodes if h.index in self.graph.outdated and h.status in ("failed", "skipped")}
         self.graph.nodes[:] = [h for h in self.graph.nodes if h not in gone]
         self.result.failures = [f for f in self.result.failures if f.label not in {h.label for h in gone}]
-        for waiting in self.graph.expansions:
+        for waiting in self.graph.waiting:
             missing = [h for h in waiting.handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             status = "planned" if self.dry else "skipped"
@@ -499,7 +499,7 @@ class _Run:
 def _given(handle: Handle) -> Ref | int:
     """An input as it is handed over: its artifact without the facts, which the task reads, or the number of the call
     that makes it."""
-    return handle.index if handle.ref is None else light(handle.ref)
+    return handle.index if handle.ref is None else without_facts(handle.ref)
 
 
 def _labels(handles: list[Handle]) -> str:

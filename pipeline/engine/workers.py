@@ -40,7 +40,7 @@ from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Spec, each, flat
+from rille.pipeline.engine.spec import Spec, flatten_ports, map_ports
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError, RilleError
@@ -75,7 +75,7 @@ class Call:
 
     def upstream(self) -> list[int]:
         """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
-        return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
+        return list(dict.fromkeys(g for g in flatten_ports(self.refs) if isinstance(g, int)))
 
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed | NotBegun:
         """Run it here, with the artifacts of the calls that it waited for, unless one did not come."""
@@ -86,7 +86,7 @@ class Call:
             found: Ref = made[given] if isinstance(given, int) else given
             return found
 
-        refs = each(ref, self.refs)
+        refs = map_ports(ref, self.refs)
         try:
             return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
         except Exception as error:
@@ -208,7 +208,7 @@ class Inline:
         call = self._calls.pop(0)
         ended = call.run(self._made)
         if isinstance(ended, Outcome):
-            self._made[call.number] = light(ended.ref)
+            self._made[call.number] = without_facts(ended.ref)
         return [(call.number, ended)]
 
     def scale(self, jobs: int) -> None:
@@ -493,10 +493,10 @@ def _run(pickled: bytes, made: list[Ref | None], worker: str, ours: bool) -> tup
     if isinstance(ended, Outcome):
         ended = replace(ended, took=replace(ended.took, worker=worker))
     # Events travel as msgpack, which has no types of ours: bytes pass.
-    return pickle.dumps((call.number, name, ended)), light(ended.ref) if isinstance(ended, Outcome) else None
+    return pickle.dumps((call.number, name, ended)), without_facts(ended.ref) if isinstance(ended, Outcome) else None
 
 
-def light(ref: Ref) -> Ref:
+def without_facts(ref: Ref) -> Ref:
     """Return a reference without its facts: a task reads them from the store, and those of a trajectory are large."""
     return replace(ref, meta={})
 

@@ -27,7 +27,7 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
 
-Steps = Generator[Wait, Any, None]
+Flow = Generator[Wait, Any, None]
 
 
 def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
@@ -56,7 +56,7 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
             p.crosscheck_accuracy = make.node(accuracy_stage, "accuracy/crosscheck", trajectory=p.crosscheck, **known)
 
 
-def of_pair(make: Builder, pair: Pair) -> Steps:
+def of_pair(make: Builder, pair: Pair) -> Flow:
     """The disparity of a pair, and its local elevation model."""
     exact_disparity = make.sequence.truth_disparity
     if exact_disparity is not None:
@@ -78,7 +78,7 @@ def of_pair(make: Builder, pair: Pair) -> Steps:
     )
 
 
-def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
+def of_world(make: Builder, pairs: Sequence[Pair]) -> Flow:
     """The merged elevation model, and the path over it on the hazards of the exact one."""
     p, first = make.products, pairs[0]
     if make.sequence.truth_dem is None or _truth(make, first.frame) is None:

@@ -105,7 +105,7 @@ def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Bui
     return made
 
 
-def name(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
+def name_graph(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
     """Say what a graph works on: hints of earlier runs are kept by it."""
     graph.sequence, graph.choice = sequence.name, digest(tuple(frames))[:16]
 
@@ -164,11 +164,11 @@ class Builder:
     def recalibrate(self, correction: list[float], since: int) -> None:
         """Go on with the calibration corrected; what does not rest on it is the same task as before."""
         self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
-        self.again(since)
+        self.discard(since)
         for cached in ("given_rig", "given_lenses"):
             self.__dict__.pop(cached, None)
 
-    def again(self, since: int) -> None:
+    def discard(self, since: int) -> None:
         """The tasks laid out ``since`` a number are of no account any more, unless they are laid out again."""
         self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
@@ -197,7 +197,7 @@ class Builder:
         return found
 
     @once
-    def taken(self, frame: int, camera: str) -> Handle:
+    def raw_image(self, frame: int, camera: str) -> Handle:
         """One image as the camera took it."""
         ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
         grey = 4.0 * ideal.width * ideal.height  # float32
@@ -206,7 +206,7 @@ class Builder:
     @once
     def image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""
-        image = self.taken(frame, camera)
+        image = self.raw_image(frame, camera)
         if camera == "left":
             self.products.images[frame] = image
         lens = (self.sequence.lenses or {}).get(camera)
@@ -251,7 +251,7 @@ class Builder:
         return self.node(motion_stage, f"motion/{a}-{b}", **images)
 
     @once
-    def sides(self, frame: int) -> Handle[SwapFacts]:
+    def swap_check(self, frame: int) -> Handle[SwapFacts]:
         """Whether the images of a pair are exchanged."""
         images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)

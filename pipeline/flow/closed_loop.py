@@ -43,7 +43,7 @@ from rille.datasets.protocol import Sequence, Simulation
 from rille.datasets.text.count import count
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.flow.builders import Builder, Pair, Segment, name
+from rille.pipeline.flow.builders import Builder, Pair, Segment, name_graph
 from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
@@ -535,7 +535,7 @@ class DriveBuilder(Builder):
         super().__init__(graph, sequence, config)
         self.drive = drive
 
-    def taken(self, frame: int, camera: str) -> Handle:
+    def raw_image(self, frame: int, camera: str) -> Handle:
         """One image of the scene as it is now, from the true pose of the frame."""
         pose = RigidTransform.from_matrix(self.drive.true[frame])
         source = self.drive.simulation.image(frame, camera, pose)
@@ -549,7 +549,7 @@ def _failed(handle: Handle) -> bool:
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> tuple[Products, Drive | None]:
     """Start what suits a sequence: the reconstruction of a recorded one, or a drive; what it delivers."""
-    name(graph, sequence, frames)
+    name_graph(graph, sequence, frames)
     if sequence.simulation is not None:
         drive = Drive(graph, sequence, config)
         return drive.build(), drive

@@ -102,11 +102,11 @@ TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
 
-CALIBRATIONS = 6
+MAX_CALIBRATIONS = 6
 """Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
 half a degree off two."""
 
-ODD = (
+MISFIT = (
     "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
 )
 """Cause of a frame that is lost by its rig."""
@@ -114,11 +114,11 @@ ODD = (
 TORN = "it shows two motions, and without it the frames beside it show one: its images are torn, or something passed by"
 """Cause of a frame that is lost by its motions."""
 
-Steps = Generator[Wait, Any, None]
+Flow = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
 
 
-def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
+def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
     """Lay out the reconstruction of the chosen frames, in order.
 
     Raises
@@ -141,7 +141,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     make.orientation(whole[0])
     if make.config.crosscheck.enabled and len(whole) > 1:
         # What is laid out first runs first: its windows take longest of all tasks.
-        p.crosscheck = another_program(make, whole)
+        p.crosscheck = crosscheck_tasks(make, whole)
     # Features also tell places that are seen again; where the crosscheck is wanted, it has them all.
     yield Complete(("crosscheck", "crosscheck_join", *(("features",) if make.config.crosscheck.enabled else ())))
 
@@ -165,7 +165,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         levels=[matched[s.frames[0]].level for s in segments] or [first.level],
         intrinsics=p.intrinsics,
         frames=list(frames),
-        steps=steps_of(make, chosen),
+        steps=step_measures(make, chosen),
         lost=sorted([*missing, *fitting.lost], key=lambda item: item["frame"]) or None,
     )
     yield from adjusted(make, frames, list(pairs.values()))
@@ -199,11 +199,11 @@ def tracked(
     While tracks contradict images, go on without these; while they contradict the cameras, lay out anew with corrected
     ones all that rests on these.
     """
-    p, turn, since = make.products, 0, len(make.graph.nodes)
+    p, attempt, since = make.products, 0, len(make.graph.nodes)
     torn: dict[int, str] | None = None
     while True:
-        if turn and p.crosscheck is not None:
-            p.crosscheck = another_program(make, whole)
+        if attempt and p.crosscheck is not None:
+            p.crosscheck = crosscheck_tasks(make, whole)
         found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
         choice = found.choice
         if choice is None:
@@ -212,26 +212,26 @@ def tracked(
         matched = yield from matched_pairs(make, choice.rigs)
 
         # Behind each basic pair: tracks, and poses in its frame. A frame is known by its place in the chain.
-        ways = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
-        segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
-        segments, moved = yield from unmoved(make, matched, segments)
+        runs = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
+        segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
+        segments, moved = yield from refuse_knocked(make, matched, segments)
         p.resections = [s.resection for s in segments]
-        wanted = suspected(segments, found.chain) if torn is None else kept_out(segments, found.chain, torn)
+        wanted = suspects(segments, found.chain) if torn is None else confirmed(segments, found.chain, torn)
         if wanted != (torn or {}):
             torn = wanted
-            make.again(since)
+            make.discard(since)
             continue
         key = matched[choice.basic[0]]
-        asked = (yield from asked_for(make, key)) if segments and make.config.resect.joint else None
-        if asked is None or turn == CALIBRATIONS:
+        correction = (yield from corrected_calibration(make, key)) if segments and make.config.resect.joint else None
+        if correction is None or attempt == MAX_CALIBRATIONS:
             if p.intrinsics is not None:
                 p.contradictions.append(p.intrinsics)
             return Tracked(choice, found.lost, matched, segments, moved)
-        make.recalibrate(asked["corrected"], since)
-        turn += 1
+        make.recalibrate(correction["corrected"], since)
+        attempt += 1
 
 
-def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], posed: Ref[TrajectoryFacts]) -> Steps:
+def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], posed: Ref[TrajectoryFacts]) -> Flow:
     """The largest piece of the trajectory: its models straight on the world lattice, merged; hazards and the path.
 
     Raises
@@ -249,12 +249,12 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     there = [k for k in pairs if k in world and positions[k]]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
-    prints = [
+    indexed = [
         make.node(tile_index_stage, f"tile_index/{k}", dem=dem, side=TILE_CELLS) for k, dem in p.world_dem.items()
     ]
     yield Complete(("moving", "pose", "locus", "tile_index"))
     # A pair whose model failed is left out of the world: the others make a map with a hole.
-    laid = yield Maybe(prints)
+    laid = yield Maybe(indexed)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
     if not footprints:
         remedy = "set locus.cell_size greater, or look at the disparities' validity"
@@ -267,8 +267,8 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
     yield Complete(("overlap_qa", "overlap_audit"))
     levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
-    unsure: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics] if p.intrinsics else [])
-    rig_error = unsure[0].meta.get("inverse_depth_std") if unsure and unsure[0] else None
+    intrinsics: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics] if p.intrinsics else [])
+    rig_error = intrinsics[0].meta.get("inverse_depth_std") if intrinsics and intrinsics[0] else None
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"], rig_error)
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
@@ -278,7 +278,7 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
-def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
+def step_tables(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
     """Motions along some frames in tables, cut by frame numbers: where a frame is left out, the other tables stay."""
     made: dict[tuple[int, ...], list[Handle[StepTableFacts]]] = make.made.setdefault("steps", {})
     if tuple(frames) not in made:
@@ -297,14 +297,14 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
     ``timed``: compare left and right of all frames, not only where the images ask for it.
     """
     qualities = [make.quality(frame) for frame in whole]
-    along = steps(make, whole)
+    along = step_tables(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
-    sides = {frame: make.sides(frame) for frame in whole} if timed else dict[int, Handle]()
-    which, turn = "/timed" if timed else "", 0
+    sides = {frame: make.swap_check(frame) for frame in whole} if timed else dict[int, Handle]()
+    which, attempt = "/timed" if timed else "", 0
     while True:
         asked = make.node(
             frame_screening_stage,
-            f"frame_screening{which}/{turn}" if turn else f"frame_screening{which}",
+            f"frame_screening{which}/{attempt}" if attempt else f"frame_screening{which}",
             frames=whole,
             bridged=list(bridges) or None,
             qualities=qualities,
@@ -318,8 +318,8 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
             make.products.screening = asked
             return found
         bridges |= {(a, b): make.motion(a, b) for a, b in asks["bridges"]}
-        sides |= {frame: make.sides(frame) for frame in asks["sides"]}
-        turn += 1
+        sides |= {frame: make.swap_check(frame) for frame in asks["sides"]}
+        attempt += 1
 
 
 @dataclass(frozen=True)
@@ -348,7 +348,7 @@ def basic_pairs(
     p.keyframes = make.node(
         keyframes_stage,
         f"keyframes{which}",
-        steps=steps(make, chain),
+        steps=step_tables(make, chain),
         frames=len(chain),
         unfit=[k for k, f in enumerate(chain) if f in unfit] or None,
         behind=behind or None,
@@ -364,7 +364,7 @@ def basic_pairs(
     return Choice(which, chosen, basic, known, judged, suspects)
 
 
-def of_other_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
+def compare_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
     """Compare pairs of doubtful rows with right images of other times."""
     # 12: pairs that are compared at once.
     asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
@@ -409,10 +409,10 @@ def simultaneous(
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
         late = found.meta.get("late", [])
         if late and not p.contradictions:
-            p.contradictions.append(lost_by_time(make, late, whole))
+            p.contradictions.append(synchrony_of_late(make, late, whole))
         choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
         if choice.suspects:
-            apart = yield from of_other_times(make, choice, chain)
+            apart = yield from compare_times(make, choice, chain)
             partners = apart.meta["partners"]
             if partners and not timed:
                 # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
@@ -428,7 +428,7 @@ def simultaneous(
                 # A rig that images of two times show is none: a camera that moves in it did not.
                 p.rigs = {} if partners else p.rigs
                 if late and partners:
-                    p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
+                    p.contradictions[:] = [synchrony_of_late(make, sorted({*late, *(k for k, _ in partners)}), whole)]
                 return Simultaneous(chain, lost, None)
             if partners:
                 wrong |= {pair for pair, _ in partners}
@@ -437,7 +437,7 @@ def simultaneous(
         alone = set[int]() if late else misfits(choice, mode)
         if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= dict.fromkeys(alone, ODD)
+            odd |= dict.fromkeys(alone, MISFIT)
         elif any("knocked" in one.meta for one in choice.judged):
             p.contradictions.append(p.rigs[choice.basic[0]])
             # One calibration does not describe this rig: each pair has its own.
@@ -451,7 +451,7 @@ def resected(segments: list[Segment]) -> list[ResectFacts]:
     return [s.resection.ref.meta for s in segments if s.resection.ref is not None]
 
 
-def suspected(segments: list[Segment], chain: list[int]) -> dict[int, str]:
+def suspects(segments: list[Segment], chain: list[int]) -> dict[int, str]:
     """Frames to go on without, and why.
 
     Left and right of a pair do not fit each other where a part of its disparities departs from the landmarks' (in few
@@ -473,10 +473,10 @@ def suspected(segments: list[Segment], chain: list[int]) -> dict[int, str]:
     # 0.7: of the landmarks that were found: in sound images 0.9 agree, by night 0.7.
     split = {one["frame"] for one in behind_key if one["inliers"] < 0.7 * one["landmarks"]}
     pairs = [part[0]["frame"] for part in parts if {one["frame"] for one in part[:2]} <= split]
-    return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, ODD)
+    return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, MISFIT)
 
 
-def kept_out(segments: list[Segment], chain: list[int], tried: dict[int, str]) -> dict[int, str]:
+def confirmed(segments: list[Segment], chain: list[int], tried: dict[int, str]) -> dict[int, str]:
     """Of the frames that it was ``tried`` to go on without, those that stay out.
 
     Behind something that moves by itself frames show two motions as well: such a frame is kept out only where nearly
@@ -486,10 +486,10 @@ def kept_out(segments: list[Segment], chain: list[int], tried: dict[int, str]) -
     behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
     # 0.8: of its landmarks.
     one_motion = {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
-    return {f: why for f, why in tried.items() if why == ODD or f in one_motion}
+    return {f: why for f, why in tried.items() if why == MISFIT or f in one_motion}
 
 
-def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
+def synchrony_of_late(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
     """Which right images are of the time of some left ones: of the first, which tell where they begin to be late, and
     of others over the sequence, by how much."""
     shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
@@ -538,7 +538,7 @@ def vertical(make: Builder, pair: int) -> dict[str, Any]:
     return args
 
 
-def unmoved(
+def refuse_knocked(
     make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]
 ) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
     """Segments, those refused whose basic pair measures otherwise than the first: its rig was knocked; and such pairs.
@@ -559,12 +559,12 @@ def unmoved(
     return out, moved
 
 
-def steps_of(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
+def step_measures(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
     """Return, for each step to the next frame, the displacement as an angle (radians; None: not known) and the share of
     matching pixels."""
     lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
-    turns = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
-    return [[turn, share] for turn, share in zip(turns, chosen.meta["match_rate"], strict=True)]
+    angles = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
+    return [[angle, share] for angle, share in zip(angles, chosen.meta["match_rate"], strict=True)]
 
 
 def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
@@ -585,10 +585,10 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
     return {**said, "times": times, "timed": s.times is not None, "georeference": place}
 
 
-def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
+def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Flow:
     """Adjust the trajectory to places that are seen again and to other sensors, where there are any."""
     p, known = make.products, sensors(make, frames)
-    p.loops = yield from seen_again(make, pairs)
+    p.loops = yield from loop_closures(make, pairs)
     if not p.resections or not (known or p.loops):
         return
     p.chained = p.trajectory
@@ -624,7 +624,7 @@ def moving_parts(
     return out
 
 
-def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
+def corrected_calibration(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
     """Another calibration that all segments ask for, None where they do not; of the rig of pair ``key``."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
@@ -636,7 +636,7 @@ def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsF
     return facts if facts and "corrected" in facts and any(facts["correction"]) else None
 
 
-def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
+def loop_closures(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
     """Motions to basic pairs from earlier ones that show the same place; none where no place is seen again."""
     if not make.config.loops.enabled or len(pairs) <= make.config.loops.apart:
         return []
@@ -649,7 +649,7 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
         blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
     laid: list[Ref[PlacesFacts]] = yield list(blocks)
     compared = [
-        loop(make, [of[k] for k in (frame, *earlier)])
+        loop_closure(make, [of[k] for k in (frame, *earlier)])
         for block in laid
         for frame, earlier in zip(block.meta["pairs"], block.meta["candidates"], strict=True)
         if earlier
@@ -659,7 +659,7 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
     return known if any(ref is not None and ref.meta["factors"] for ref in seen) else []
 
 
-def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
+def loop_closure(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
     """Motions to the first of some pairs from each of the others, which look alike."""
     frames = [pair.frame for pair in pairs]
     return make.node(
@@ -672,7 +672,7 @@ def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
     )
 
 
-def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
+def crosscheck_tasks(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
     """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
     features = {(f, camera): make.features(f, camera) for f in whole for camera in CAMERAS}
     parts = [
