@@ -46,7 +46,7 @@ class Progress:
         self.done += 1
 
     def failed(self, label: str, error: BaseException) -> None:
-        """A task or an expansion failed."""
+        """A task or a flow failed."""
 
     def close(self, result: Result) -> None:
         """The run has ended."""

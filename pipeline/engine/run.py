@@ -1,4 +1,4 @@
-"""Runs a graph: looks up what is there, gives the rest to workers, goes on with flows as results arrive.
+"""Run a graph: look its tasks up in the cache, give the others to workers, continue its flows as results arrive.
 
 >>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
@@ -8,15 +8,15 @@
 Nodes are taken in the order of their creation. One whose inputs are there has a key, and is looked up; one whose inputs
 are being computed is given to the workers as well, which chain it. A run that finds everything starts no worker. With
 ``dry=True`` nothing is computed: ``status`` of the handles is ``cached`` or ``planned``, and ``reason`` says why
-(``rille plan``). What depends on results still to come is laid out by those of an earlier run where there was one
-(``Result.assumed``), else it is not known (``Result.unknown``).
+(``rille plan``). Tasks that depend on results still to come are laid out by those of an earlier run
+(``Result.assumed``); if there are none, these tasks are unknown (``Result.unknown``).
 
-What a stage raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and what depends on it
-is skipped. Where the data do not determine an answer (:class:`~rille.stages.core.errors.DegenerateError`) everything
-else finishes: the run has a hole. After any other error nothing new is begun, unless with ``keep_going``. An artifact
-that is found damaged, or gone, when a task reads it is computed again, and the task after it. A task whose workers died
-is tried once more when nothing else runs. In every case the ledger has one line for each node that is missing, with the
-reason.
+A stage that raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and the tasks that
+depend on it are skipped. Where the data do not determine an answer
+(:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
+no task is begun, unless with ``keep_going``. An artifact that a task finds damaged, or gone, is computed again, and the
+task after it. A task whose workers died is tried once more when nothing else runs. In every case the ledger has a line
+for each missing node, with the reason.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class Failure:
 class Result:
     """Outcome of a run; ``counts`` are numbers of nodes by their status.
 
-    Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
-    hide it. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
+    Of a dry run: ``assumed`` are labels whose earlier results were used to lay out later tasks, ``unknown`` those whose
+    later tasks are unknown. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -85,7 +85,7 @@ class Result:
         return not self.interrupted and not self.failures and not self.counts["skipped"]
 
     def check(self, *, holes: bool = False) -> None:
-        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
+        """Raise the first failure as one line with its label: the original error of Rille, or one that wraps another.
 
         With ``holes`` failures that lie in the data are passed over.
         """
@@ -119,8 +119,8 @@ class RunOptions:
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
-    kept : the workers that a run has left are used by the next one that is given the same list, and whoever made it
-        ends them; None: those of this run end with it.
+    kept : list that holds the workers after the run, for the next run with the same list; its maker ends them. None:
+        the workers end with the run.
     """
 
     executor: Any = "dask"
@@ -362,7 +362,7 @@ class _Run:
     # -- what comes back ----------------------------------------------------------------------------------------
 
     def _land(self, handle: Handle, ended: Ended) -> None:
-        """Take up what the workers give back."""
+        """Take up the outcome of a call."""
         if isinstance(ended, Outcome):
             self._succeed(handle, ended)
         elif isinstance(ended, NotBegun):
@@ -405,7 +405,7 @@ class _Run:
 
     def _heal(self, handle: Handle, error: BaseException) -> bool:
         """Have inputs that were damaged or gone when a task read them computed again, and the task after them."""
-        # Times that a task is begun again because an input was damaged or gone when it read it
+        # 3: times that a task is begun again for such an input.
         if not isinstance(error, DamagedError | GoneError) or self.heals[handle.index] >= 3:
             return False
         self.heals[handle.index] += 1

@@ -33,12 +33,12 @@ B = TypeVar("B")
 
 
 def map_ports(change: Callable[[A], B], ports: Mapping[str, A | list[A]]) -> dict[str, B | list[B]]:
-    """What ``change`` makes of each thing that is given to a port; a list stays one."""
+    """Apply ``change`` to each item that is given to a port; a list stays a list."""
     return {p: [change(g) for g in given] if isinstance(given, list) else change(given) for p, given in ports.items()}
 
 
 def flatten_ports(ports: Mapping[str, A | list[A]]) -> list[A]:
-    """All that is given, in order of the ports."""
+    """All items, in order of the ports."""
     return [g for given in ports.values() for g in (given if isinstance(given, list) else [given])]
 
 

@@ -48,14 +48,14 @@ from rille.stages.core.errors import ConfigError, RilleError
 KINDS = ("dask", "inline")
 
 WATCH_SECONDS = 0.2
-"""Time until something else than an end of a task is looked after."""
+"""Longest wait for the end of a task, and for workers, between two looks at lost calls and at the scheduler."""
 
 CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
 """Time within which a scheduler must have answered, at first and later."""
 
 NO_WORKERS_SECONDS, START_SECONDS = 30.0, 120.0
-"""Time that a scheduler may be without workers, at the beginning or later, before the run is given up; the second: that
-workers of our own may take to start, on a machine that others use."""
+"""Time without workers after which a run is given up: on another's scheduler, and on our own, where workers start
+slowly if the machine is busy."""
 
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
@@ -133,7 +133,7 @@ Ended = Outcome | Failed | NotBegun | Died
 
 
 def check(kind: Any, jobs: int | None = None) -> None:
-    """Refuse an executor that there is not, before any work.
+    """Refuse an unknown executor before any work.
 
     Raises
     ------
@@ -347,14 +347,14 @@ class Dask:
         return ended
 
     def _lost(self) -> list[tuple[int, Ended]]:
-        """What has ended without a word."""
+        """Calls that have ended without an event."""
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
         # A call must not come back before the inputs that it had.
         ended = self._events_of(0) if lost else []
         return ended + [(n, self._why(self._futures.pop(n))) for n in lost if n in self._futures]
 
     def _events_of(self, timeout: float) -> list[tuple[int, Ended]]:
-        """What has ended by its own word; the first of it is waited for."""
+        """Calls whose end an event tells; wait for the first one."""
         ended: list[tuple[int, Ended]] = []
         with suppress(queue.Empty):
             while True:
@@ -366,7 +366,7 @@ class Dask:
         return ended
 
     def _why(self, future: Any) -> Ended:
-        """Why a call ended without a word."""
+        """Outcome of a call that ended without an event."""
         from distributed import KilledWorker
 
         if future.status != "error":  # distributed cancels all futures when the connection to the scheduler is lost
@@ -472,8 +472,8 @@ Workers = Inline | Dask
 async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
     """Run a call on a worker, which is ``ours`` or another's; give its artifact to the calls that wait for it.
 
-    What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
-    does. Never an exception: dask would state it as the failure of every call that waits for this one.
+    Its outcome is sent to the client of ``run`` as an event of dask, at half the cost of fetching a result. It never
+    raises: dask would state the exception as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
@@ -486,7 +486,7 @@ async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> 
 
 
 def _run(pickled: bytes, made: list[Ref | None], worker: str, ours: bool) -> tuple[bytes, Ref | None]:
-    """Run a call on a thread of a worker; the event of it, and its artifact, if it has one."""
+    """Run a call on a thread of a worker; return its event, and its artifact, if there is one."""
     _prepare(ours=ours)
     name, call = pickle.loads(pickled)
     ended = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
