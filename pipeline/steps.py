@@ -117,7 +117,7 @@ class StereoPair:
 
     def taken(self, camera: str) -> NDArray[Any]:
         """Grey values (row, col) of an image as camera ``left`` or ``right`` took it, with its lens distortion."""
-        image = _computed(_builder(self, self.settings).taken(self.frame, camera), {}, self.sequence.drawn)
+        image = _computed(_builder(self, self.settings).raw_image(self.frame, camera), {}, self.sequence.drawn)
         return np.array(image["image"])
 
     @property
@@ -570,7 +570,7 @@ def _builder(pair: StereoPair, settings: Settings) -> Builder:
 def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
     from rille.datasets.images.files import sound
-    from rille.pipeline.engine.spec import each
+    from rille.pipeline.engine.spec import map_ports
 
     if handle in known:
         return known[handle]
@@ -578,7 +578,7 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     spec, recorded = handle.spec, handle.spec.module.startswith("rille.datasets.")
     if recorded and handle.label in drawn:
         return drawn[handle.label]
-    inputs = each(lambda source: _computed(source, known, drawn), handle.inputs)
+    inputs = map_ports(lambda source: _computed(source, known, drawn), handle.inputs)
     result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     if recorded:
         drawn[handle.label] = sound(result, handle.spec.hints.get("path", ""))

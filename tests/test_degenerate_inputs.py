@@ -18,7 +18,7 @@ import pytest
 
 import rille
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.spec import Spec, each
+from rille.pipeline.engine.spec import Spec, map_ports
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.pipeline.runs import run_files, session
 from rille.stages.core.declare import AnyArray, Array, Bundle, Stage, check_outputs
@@ -94,8 +94,8 @@ def recorded(names: list[str], folder: Path, *, outputs: bool = True) -> list[Ta
             kind = node.spec.args.get("step", node.spec.args.get("file"))
             wanted = node.inputs or node.spec.module.startswith("rille.stages.")
             if wanted and (node.spec.module, kind) not in found:
-                inputs = each(lambda h, store=opened.store: in_memory(store.open(h.ref)), node.inputs)
-                makers = each(lambda h: h.spec.stage, node.inputs)
+                inputs = map_ports(lambda h, store=opened.store: in_memory(store.open(h.ref)), node.inputs)
+                makers = map_ports(lambda h: h.spec.stage, node.inputs)
                 found[node.spec.module, kind] = Task(node.label, node.spec, inputs, makers)
     return list(found.values())
 

@@ -20,7 +20,7 @@ import numpy as np
 from rille.datasets.protocol import Sequence, Source
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.builders import recalibrated
-from rille.pipeline.flow.reconstruction import CALIBRATIONS
+from rille.pipeline.flow.reconstruction import MAX_CALIBRATIONS
 from rille.stages.core.declare import Bundle, NoParams, declared
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -129,7 +129,7 @@ class Chain:
             args["fixed"] = self.config.rig.mode == "fixed"
             found = self._stage("intrinsics", args, segments=given["segments"], rig=self.calibration)
             given["intrinsics"] = found
-            if any(found.meta["correction"]) and len(self.corrections) < CALIBRATIONS:
+            if any(found.meta["correction"]) and len(self.corrections) < MAX_CALIBRATIONS:
                 return Chain(self.given, self.config, (*self.corrections, found.meta["corrected"])).run()
         trajectory = self._stage("trajectory", {"frames": self.frames, "lost": lost}, **given)
         facts = {"basic": basic, "select": select.meta, "resect": [r.meta for r, _ in segments]}

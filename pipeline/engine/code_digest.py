@@ -8,8 +8,8 @@ their bytes. Own are ``rille.stages``, ``rille.datasets`` and the
 package of the module itself. Imports under ``if TYPE_CHECKING:`` never run and do not count; modules loaded by a
 computed name are not seen, and neither are data files beside the code: keep tables in modules.
 
-A file is read once a process: what is digested is what was imported, even while somebody edits. Parsing all of them
-takes most of a second, so what was found in a file is remembered by the bytes of the file (:func:`remember`).
+A process reads a file once: it digests the source that it imported, even while somebody edits. Parsing all of them
+takes most of a second, so the findings are remembered by the bytes of each file (:func:`remember`).
 """
 
 from __future__ import annotations

@@ -14,11 +14,11 @@ from typing import Any
 
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.runtime.atomic import named
-from rille.pipeline.engine.spec import each
+from rille.pipeline.engine.spec import map_ports
 
 
 class Ledger:
-    """Writes to a file, or nowhere."""
+    """The ledger file, open for writing; None: nowhere."""
 
     def __init__(self, path: Path | None) -> None:
         if path is not None:
@@ -33,7 +33,7 @@ class Ledger:
             "label": handle.label,
             "stage": handle.stage,
             "status": handle.status,
-            "inputs": each(lambda h: h.label, handle.inputs),
+            "inputs": map_ports(lambda h: h.label, handle.inputs),
             "reason": handle.reason,
             "key": handle.key,
             "digest": handle.ref and handle.ref.digest,
@@ -43,7 +43,7 @@ class Ledger:
         self._line({name: value for name, value in row.items() if value} | took)
 
     def note(self, label: str, status: str, reason: str) -> None:
-        """A line for what is no node: an expansion that could not be made."""
+        """Write a line about a flow that could not go on."""
         self._line({"label": label, "stage": "", "status": status, "reason": reason})
 
     def run(self, **facts: Any) -> None:

@@ -1,4 +1,4 @@
-"""Workers that others have started: what they must be.
+"""Checks of workers that others have started.
 
 Every worker must have the source code, the Python and the packages of the client, use one thread a library, and see
 the same cache: each reads a probe of the client there, and writes beside it. One that differs is named with the

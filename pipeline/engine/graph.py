@@ -8,7 +8,7 @@
 >>> graph.flow(chain(graph))
 
 A flow is a generator: it yields what it waits for, and goes on with the references of that once they are there
-(:meth:`Graph.flow`). Several run side by side; what one is made of, it takes in by ``yield from``.
+(:meth:`Graph.flow`). Several flows run side by side; ``yield from`` runs a part of one.
 
 A :class:`Handle` stands for a node; after (or during) the run its ``status`` and ``ref`` say what became of it.
 Order of creation is priority: what is created first runs first.
@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Generic, NamedTuple, cast
 
-from rille.pipeline.engine.spec import Refs, Spec, each, flat
+from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import F, Params, Stage
 
@@ -50,10 +50,10 @@ class Handle(Generic[F]):
     """A node of the graph and what became of it.
 
     ``status`` is ``pending``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
-    ``reason`` says in words why it was not found in the cache, or why it was skipped; ``cause`` is the
-    label of the input that this is due to. ``earlier``, of a planned node, is what the same label led to before: a plan
-    takes its facts for what is to come. ``expect`` are bytes (decoded) that it works on and no input has, as what it
-    reads from outside. ``took``: of a computed node, what that took.
+    ``reason`` says in words why it was not in the cache, or was skipped; ``cause`` is the label of the input that
+    caused this. ``earlier``, of a planned node, is the artifact of the same label in an earlier run, whose facts the
+    plan assumes. ``expect`` are decoded bytes that it reads besides its inputs, as from a file. ``took``: time and
+    memory of a computed node.
     """
 
     index: int
@@ -86,11 +86,11 @@ class Handle(Generic[F]):
 
     def upstream(self) -> list[Handle]:
         """Handles of all inputs, in order of the ports."""
-        return flat(self.inputs)
+        return flatten_ports(self.inputs)
 
     def refs(self) -> Refs:
         """References of all inputs by port; call it when they are done."""
-        return each(_ref, self.inputs)
+        return map_ports(_ref, self.inputs)
 
 
 class MissingError(Exception):
@@ -117,7 +117,7 @@ class Waiting(NamedTuple):
 
 
 class Complete(frozenset[str]):
-    """Names of stages of which a flow will not lay out any more tasks: where nothing else is wanted, it ends there."""
+    """Names of stages of which a flow lays out no more tasks: if nothing else is wanted, the flow ends there."""
 
 
 Awaited = Handle | Maybe | Sequence[Handle]
@@ -157,26 +157,26 @@ def first_label(label: str) -> str:
 
 @dataclass
 class Graph:
-    """Nodes in order of creation, and flows that wait for some of them (``expansions``).
+    """Nodes in order of creation, and flows that wait for some of them (``waiting``).
 
     Attributes
     ----------
     sequence, choice : name of the sequence it works on, and of the choice of its frames: hints of earlier runs are kept
         by them.
-    last : called once nothing else will be laid out: adds what reads all of it.
-    cut : what of it is wanted; None: all.
-    asked : numbers of the nodes that a cut graph computes, as far as it is known.
+    last : called once nothing else will be laid out; adds the tasks that read all of it.
+    cut : the wanted part; None: all.
+    needed : numbers of the nodes that a cut graph computes, as far as it is known.
     outdated : numbers of nodes of a calibration that has been corrected since; one that is laid out again counts again.
-    unfinished : flows that wait for something: where a plan ends with some, it does not know all tasks.
+    unfinished : number of flows that wait: a plan that ends with some does not know all tasks.
     """
 
     sequence: str = ""
     choice: str = ""
     nodes: list[Handle] = field(default_factory=list)
-    expansions: list[Waiting] = field(default_factory=list)
+    waiting: list[Waiting] = field(default_factory=list)
     last: Callable[[], None] | None = None
     cut: Cut | None = None
-    asked: set[int] = field(default_factory=set)
+    needed: set[int] = field(default_factory=set)
     unfinished: int = 0
     outdated: set[int] = field(default_factory=set)
     _labels: dict[str, Handle] = field(default_factory=dict)
@@ -192,11 +192,10 @@ class Graph:
         inputs: Mapping[str, Handle | Sequence[Handle]] | None = None,
         expect: float = 0.0,
     ) -> Handle[F]:
-        """Add a task and give its handle.
+        """Add a task and return its handle.
 
-        ``stage`` may be the dotted name of its module. ``inputs`` maps each port of the stage to a
-        handle, or to a list of them for a port declared ``name*``; ``expect`` are decoded bytes that it works on and no
-        input has, as what it reads from outside, for estimates.
+        ``stage`` may be the dotted name of its module. ``inputs`` maps each port of the stage to a handle, or to a list
+        of them for a port declared ``name*``; ``expect``: see :class:`Handle`.
 
         Raises
         ------
@@ -222,7 +221,7 @@ class Graph:
         return handle
 
     def call(self, stage: Stage[Any, F], label: str, params: Params, /, **given: Any) -> Handle[F]:
-        """Add a task by what it is given, inputs (handles) and arguments alike; None stands for an absent one."""
+        """Add a task; ``given`` are its inputs (handles) and arguments, None for an absent one."""
         args = {name: value for name, value in given.items() if value is not None}
         inputs = {name: args.pop(name) for name in stage.ports() if name in args}
         return self.node(stage, label, params, args, inputs=inputs)
@@ -232,16 +231,16 @@ class Graph:
         return self.cut is None or stage in self.cut.stages
 
     def flow(self, steps: Generator[Wait, Any, None]) -> None:
-        """Run a generator on the client until it waits, and again when what it waits for is there.
+        """Run a generator on the client until it waits, and go on once the results that it waits for are there.
 
-        It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. Where
-        one will never be, ``MissingError`` is raised in it. :class:`Complete` it yields without waiting.
+        It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. If a
+        task has failed, ``MissingError`` is raised in it. It does not wait after it yields :class:`Complete`.
         """
         self.unfinished += 1
         self._go_on(steps, lambda: next(steps))
 
     def _wait(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> Awaited | None:
-        """What a flow waits for next; None at its end, or where nothing that follows is wanted."""
+        """What a flow waits for next; None at its end, or if no later task is wanted."""
         try:
             wanted = step()
             while isinstance(wanted, Complete):
@@ -259,7 +258,7 @@ class Graph:
         except MissingError as error:
             self.unfinished -= 1
             # The flow never goes on; the end of the run names the tasks that it waited for.
-            self.expansions.append(Waiting(error.handles, lambda *_: None, holes=False))
+            self.waiting.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
         if wanted is None:
             self.unfinished -= 1
@@ -275,7 +274,7 @@ class Graph:
             else:
                 self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        self.expansions.append(Waiting(handles, resume, holes=True))
+        self.waiting.append(Waiting(handles, resume, holes=True))
 
 
 _NONE: dict[str, Any] = {}

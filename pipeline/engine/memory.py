@@ -17,7 +17,7 @@ import psutil
 
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import cores
-from rille.pipeline.engine.spec import each
+from rille.pipeline.engine.spec import map_ports
 from rille.stages.core.errors import ConfigError
 
 WORKER_BYTES = 250e6
@@ -136,7 +136,7 @@ class Estimates:
         more = handle.expect  # what it reads from outside, and what its stage adds
         with suppress(Exception):  # an estimate only, and facts may be still to come
             if stage.memory.size is not None:
-                more += stage.memory.size(handle.spec.params, handle.spec.args, each(_meta, handle.inputs))
+                more += stage.memory.size(handle.spec.params, handle.spec.args, map_ports(_meta, handle.inputs))
         size = sum(inputs) + more
         # Guesses upon guesses would grow without end along a chain: no result is larger than the largest it came from.
         most = max(*inputs, more) if inputs else math.inf

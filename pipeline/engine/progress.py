@@ -46,7 +46,7 @@ class Progress:
         self.done += 1
 
     def failed(self, label: str, error: BaseException) -> None:
-        """A task or an expansion failed."""
+        """A task or a flow failed."""
 
     def close(self, result: Result) -> None:
         """The run has ended."""
@@ -55,7 +55,7 @@ class Progress:
         """Nodes that are known and wanted by now."""
         if self.graph is None:
             return 0
-        return len(self.graph.nodes if self.graph.cut is None else self.graph.asked)
+        return len(self.graph.nodes if self.graph.cut is None else self.graph.needed)
 
 
 class Lines(Progress):

@@ -1,4 +1,4 @@
-"""Runs a graph: looks up what is there, gives the rest to workers, goes on with flows as results arrive.
+"""Run a graph: look its tasks up in the cache, give the others to workers, continue its flows as results arrive.
 
 >>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
@@ -8,15 +8,15 @@
 Nodes are taken in the order of their creation. One whose inputs are there has a key, and is looked up; one whose inputs
 are being computed is given to the workers as well, which chain it. A run that finds everything starts no worker. With
 ``dry=True`` nothing is computed: ``status`` of the handles is ``cached`` or ``planned``, and ``reason`` says why
-(``rille plan``). What depends on results still to come is laid out by those of an earlier run where there was one
-(``Result.assumed``), else it is not known (``Result.unknown``).
+(``rille plan``). Tasks that depend on results still to come are laid out by those of an earlier run
+(``Result.assumed``); if there are none, these tasks are unknown (``Result.unknown``).
 
-What a stage raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and what depends on it
-is skipped. Where the data do not determine an answer (:class:`~rille.stages.core.errors.DegenerateError`) everything
-else finishes: the run has a hole. After any other error nothing new is begun, unless with ``keep_going``. An artifact
-that is found damaged, or gone, when a task reads it is computed again, and the task after it. A task whose workers died
-is tried once more when nothing else runs. In every case the ledger has one line for each node that is missing, with the
-reason.
+A stage that raises is not tried again (but for ``OSError``: :mod:`rille.pipeline.engine.task`), and the tasks that
+depend on it are skipped. Where the data do not determine an answer
+(:class:`~rille.stages.core.errors.DegenerateError`) everything else finishes: the run has a hole. After any other error
+no task is begun, unless with ``keep_going``. An artifact that a task finds damaged, or gone, is computed again, and the
+task after it. A task whose workers died is tried once more when nothing else runs. In every case the ledger has a line
+for each missing node, with the reason.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from rille.pipeline.engine.graph import Graph, Handle, Waiting
 from rille.pipeline.engine.plain import some
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
-from rille.pipeline.engine.spec import Refs, each, key_of, recipe
+from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, code_changed
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, light, make
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
 
 MISSING = ("failed", "skipped", "planned")
@@ -67,8 +67,8 @@ class Failure:
 class Result:
     """Outcome of a run; ``counts`` are numbers of nodes by their status.
 
-    Of a dry run: ``assumed`` are labels whose earlier result served to lay out what follows, ``unknown`` those that
-    hide it. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
+    Of a dry run: ``assumed`` are labels whose earlier results were used to lay out later tasks, ``unknown`` those whose
+    later tasks are unknown. Of a cut graph: ``left_out`` counts by stage the known tasks that are not wanted.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -85,7 +85,7 @@ class Result:
         return not self.interrupted and not self.failures and not self.counts["skipped"]
 
     def check(self, *, holes: bool = False) -> None:
-        """Raise the first failure as one line with its label: the original error of Rille, or what wraps another.
+        """Raise the first failure as one line with its label: the original error of Rille, or one that wraps another.
 
         With ``holes`` failures that lie in the data are passed over.
         """
@@ -119,8 +119,8 @@ class RunOptions:
     ledger : file of JSON lines, one a node, written as they resolve.
     progress : receives every step of the run.
     memory_limit : bytes that this process and its workers may take together; None is what is free here.
-    kept : the workers that a run has left are used by the next one that is given the same list, and whoever made it
-        ends them; None: those of this run end with it.
+    kept : list that holds the workers after the run, for the next run with the same list; its maker ends them. None:
+        the workers end with the run.
     """
 
     executor: Any = "dask"
@@ -153,7 +153,7 @@ class _Run:
     Attributes
     ----------
     taken : nodes of the graph that were taken up, in order.
-    again : numbers of nodes to be taken up again, the least first.
+    retries : numbers of nodes to be taken up again, the least first.
     in_flight : with the workers, or in ``calls``.
     calls : what the workers are given next, all at once.
     suspects : numbers of nodes whose workers died; each is tried when nothing else runs, and is then in ``alone``.
@@ -170,7 +170,7 @@ class _Run:
         self.estimates, self.largest = memory.Estimates(), 0.0
         self.stopped = ""
         self.taken = 0
-        self.again: list[int] = []
+        self.retries: list[int] = []
         self.in_flight: dict[int, Handle] = {}
         self.calls: list[Call] = []
         self.suspects: list[int] = []
@@ -179,7 +179,7 @@ class _Run:
         self.before: dict[int, str] = {}
         self.history = provenance.History(store, graph.sequence, graph.choice)
         self.seen = 0
-        self._ask()
+        self._mark_needed()
 
     def go(self) -> Result:
         begin = time.perf_counter()
@@ -235,20 +235,20 @@ class _Run:
                 if number in self.in_flight:  # not if the run was stopped by one before
                     self._land(self.in_flight.pop(number), ended)
 
-    def _ask(self) -> None:
+    def _mark_needed(self) -> None:
         """Find what a cut graph asks for by now: wanted nodes, what flows wait for, and all that these need."""
         cut, nodes = self.graph.cut, self.graph.nodes
         if cut is None:
             return
         wanted = [h for h in nodes[self.seen :] if cut.wants(h)]
-        wanted += [h for waiting in self.graph.expansions for h in waiting.handles]
+        wanted += [h for waiting in self.graph.waiting for h in waiting.handles]
         self.seen = len(nodes)
         while wanted:
             handle = wanted.pop()
-            if handle.index not in self.graph.asked:
-                self.graph.asked.add(handle.index)
+            if handle.index not in self.graph.needed:
+                self.graph.needed.add(handle.index)
                 if handle.index < self.taken:
-                    heapq.heappush(self.again, handle.index)
+                    heapq.heappush(self.retries, handle.index)
                 wanted += handle.upstream()
 
     # -- what becomes of a node ---------------------------------------------------------------------------------
@@ -265,11 +265,11 @@ class _Run:
             number = heapq.heappop(self.suspects)
             self.alone.add(number)
             self._settle(self.graph.nodes[number])
-        elif self.again:
-            self._settle(self.graph.nodes[heapq.heappop(self.again)])
+        elif self.retries:
+            self._settle(self.graph.nodes[heapq.heappop(self.retries)])
         elif self.taken < len(self.graph.nodes):
             self.taken += 1
-            if self.graph.cut is None or self.taken - 1 in self.graph.asked:
+            if self.graph.cut is None or self.taken - 1 in self.graph.needed:
                 self._settle(self.graph.nodes[self.taken - 1])
         else:
             return False
@@ -315,7 +315,7 @@ class _Run:
             self.largest = needs
             if self.workers is not None:
                 self.workers.scale(self.budget.workers(needs))
-        given, force = each(_given, handle.inputs), handle.stage in self.force
+        given, force = map_ports(_given, handle.inputs), handle.stage in self.force
         self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
 
@@ -362,11 +362,11 @@ class _Run:
     # -- what comes back ----------------------------------------------------------------------------------------
 
     def _land(self, handle: Handle, ended: Ended) -> None:
-        """Take up what the workers give back."""
+        """Take up the outcome of a call."""
         if isinstance(ended, Outcome):
             self._succeed(handle, ended)
         elif isinstance(ended, NotBegun):
-            heapq.heappush(self.again, handle.index)
+            heapq.heappush(self.retries, handle.index)
         elif isinstance(ended, Died) and handle.index not in self.alone:
             heapq.heappush(self.suspects, handle.index)
         elif isinstance(ended, Died):
@@ -405,7 +405,7 @@ class _Run:
 
     def _heal(self, handle: Handle, error: BaseException) -> bool:
         """Have inputs that were damaged or gone when a task read them computed again, and the task after them."""
-        # Times that a task is begun again because an input was damaged or gone when it read it
+        # 3: times that a task is begun again for such an input.
         if not isinstance(error, DamagedError | GoneError) or self.heals[handle.index] >= 3:
             return False
         self.heals[handle.index] += 1
@@ -414,8 +414,8 @@ class _Run:
                 self.before[source.index] = source.ref.digest
                 source.reason = "its artifact was found damaged, or gone, when it was read"
                 source.ref, source.status = None, "pending"
-                heapq.heappush(self.again, source.index)
-        heapq.heappush(self.again, handle.index)
+                heapq.heappush(self.retries, source.index)
+        heapq.heappush(self.retries, handle.index)
         return True
 
     def _fail(self, handle: Handle, failed: Failed) -> None:
@@ -442,19 +442,19 @@ class _Run:
         """Go on with the first flow whose handles are done, or lay out what comes last; whether there was such."""
         if self.stopped or self.suspects:
             return False
-        for i, waiting in enumerate(self.graph.expansions):
+        for i, waiting in enumerate(self.graph.waiting):
             lost = ("failed", "skipped") if waiting.holes else ()
             if all(h.done or h.earlier or h.status in lost for h in waiting.handles):
-                del self.graph.expansions[i]
+                del self.graph.waiting[i]
                 self._expand(waiting)
-                self._ask()
+                self._mark_needed()
                 return True
         last = self.graph.last
-        if last is None or (self.graph.expansions and self.in_flight):
+        if last is None or (self.graph.waiting and self.in_flight):
             return False
         self.graph.last = None
         last()
-        self._ask()
+        self._mark_needed()
         return True
 
     def _expand(self, waiting: Waiting) -> None:
@@ -476,8 +476,8 @@ class _Run:
         """Account for everything that was not even begun; drop the nodes that a cut graph does not ask for, and
         those of an outdated calibration that failed."""
         if self.graph.cut is not None:
-            self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.asked)
-            self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.asked]
+            self.result.left_out.update(h.stage for h in self.graph.nodes if h.index not in self.graph.needed)
+            self.graph.nodes[:] = [h for h in self.graph.nodes if h.index in self.graph.needed]
         for handle in self.graph.nodes:
             if handle.status == "pending":
                 lost = next((h for h in handle.upstream() if h.status in MISSING), None)
@@ -489,7 +489,7 @@ class _Run:
         gone = {h for h in self.graph.nodes if h.index in self.graph.outdated and h.status in ("failed", "skipped")}
         self.graph.nodes[:] = [h for h in self.graph.nodes if h not in gone]
         self.result.failures = [f for f in self.result.failures if f.label not in {h.label for h in gone}]
-        for waiting in self.graph.expansions:
+        for waiting in self.graph.waiting:
             missing = [h for h in waiting.handles if not h.done]
             self.result.unknown += [h.label for h in missing]
             status = "planned" if self.dry else "skipped"
@@ -499,7 +499,7 @@ class _Run:
 def _given(handle: Handle) -> Ref | int:
     """An input as it is handed over: its artifact without the facts, which the task reads, or the number of the call
     that makes it."""
-    return handle.index if handle.ref is None else light(handle.ref)
+    return handle.index if handle.ref is None else without_facts(handle.ref)
 
 
 def _labels(handles: list[Handle]) -> str:

@@ -32,13 +32,13 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-def each(change: Callable[[A], B], ports: Mapping[str, A | list[A]]) -> dict[str, B | list[B]]:
-    """What ``change`` makes of each thing that is given to a port; a list stays one."""
+def map_ports(change: Callable[[A], B], ports: Mapping[str, A | list[A]]) -> dict[str, B | list[B]]:
+    """Apply ``change`` to each item that is given to a port; a list stays a list."""
     return {p: [change(g) for g in given] if isinstance(given, list) else change(given) for p, given in ports.items()}
 
 
-def flat(ports: Mapping[str, A | list[A]]) -> list[A]:
-    """All that is given, in order of the ports."""
+def flatten_ports(ports: Mapping[str, A | list[A]]) -> list[A]:
+    """All items, in order of the ports."""
     return [g for given in ports.values() for g in (given if isinstance(given, list) else [given])]
 
 
@@ -83,7 +83,7 @@ def key_of(spec: Spec, refs: Refs) -> str:
 
 
 def _own(spec: Spec, refs: Refs) -> dict[str, Any]:
-    return {"params": spec.params, "args": dict(spec.args), "inputs": each(attrgetter("digest"), refs)}
+    return {"params": spec.params, "args": dict(spec.args), "inputs": map_ports(attrgetter("digest"), refs)}
 
 
 @cache

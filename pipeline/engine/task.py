@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rille.pipeline.engine.graph import Took
 from rille.pipeline.engine.runtime.kernels import COMPILING
-from rille.pipeline.engine.spec import Refs, Spec, each, key_of, recipe
+from rille.pipeline.engine.spec import Refs, Spec, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Bundle, check_outputs
@@ -75,7 +75,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
 
 def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float]:
     stage = spec.stage
-    inputs = each(store.open, refs)
+    inputs = map_ports(store.open, refs)
     started = time.time()
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)

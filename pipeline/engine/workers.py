@@ -40,7 +40,7 @@ from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Spec, each, flat
+from rille.pipeline.engine.spec import Spec, flatten_ports, map_ports
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError, RilleError
@@ -48,14 +48,14 @@ from rille.stages.core.errors import ConfigError, RilleError
 KINDS = ("dask", "inline")
 
 WATCH_SECONDS = 0.2
-"""Time until something else than an end of a task is looked after."""
+"""Longest wait for the end of a task, and for workers, between two looks at lost calls and at the scheduler."""
 
 CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
 """Time within which a scheduler must have answered, at first and later."""
 
 NO_WORKERS_SECONDS, START_SECONDS = 30.0, 120.0
-"""Time that a scheduler may be without workers, at the beginning or later, before the run is given up; the second: that
-workers of our own may take to start, on a machine that others use."""
+"""Time without workers after which a run is given up: on another's scheduler, and on our own, where workers start
+slowly if the machine is busy."""
 
 LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
 """Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
@@ -75,7 +75,7 @@ class Call:
 
     def upstream(self) -> list[int]:
         """Numbers of the calls in flight that it waits for, each once, in a fixed order."""
-        return list(dict.fromkeys(g for g in flat(self.refs) if isinstance(g, int)))
+        return list(dict.fromkeys(g for g in flatten_ports(self.refs) if isinstance(g, int)))
 
     def run(self, made: Mapping[int, Ref]) -> Outcome | Failed | NotBegun:
         """Run it here, with the artifacts of the calls that it waited for, unless one did not come."""
@@ -86,7 +86,7 @@ class Call:
             found: Ref = made[given] if isinstance(given, int) else given
             return found
 
-        refs = each(ref, self.refs)
+        refs = map_ports(ref, self.refs)
         try:
             return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
         except Exception as error:
@@ -133,7 +133,7 @@ Ended = Outcome | Failed | NotBegun | Died
 
 
 def check(kind: Any, jobs: int | None = None) -> None:
-    """Refuse an executor that there is not, before any work.
+    """Refuse an unknown executor before any work.
 
     Raises
     ------
@@ -208,7 +208,7 @@ class Inline:
         call = self._calls.pop(0)
         ended = call.run(self._made)
         if isinstance(ended, Outcome):
-            self._made[call.number] = light(ended.ref)
+            self._made[call.number] = without_facts(ended.ref)
         return [(call.number, ended)]
 
     def scale(self, jobs: int) -> None:
@@ -347,14 +347,14 @@ class Dask:
         return ended
 
     def _lost(self) -> list[tuple[int, Ended]]:
-        """What has ended without a word."""
+        """Calls that have ended without an event."""
         lost = [n for n, future in self._futures.items() if future.status not in ("pending", "finished")]
         # A call must not come back before the inputs that it had.
         ended = self._events_of(0) if lost else []
         return ended + [(n, self._why(self._futures.pop(n))) for n in lost if n in self._futures]
 
     def _events_of(self, timeout: float) -> list[tuple[int, Ended]]:
-        """What has ended by its own word; the first of it is waited for."""
+        """Calls whose end an event tells; wait for the first one."""
         ended: list[tuple[int, Ended]] = []
         with suppress(queue.Empty):
             while True:
@@ -366,7 +366,7 @@ class Dask:
         return ended
 
     def _why(self, future: Any) -> Ended:
-        """Why a call ended without a word."""
+        """Outcome of a call that ended without an event."""
         from distributed import KilledWorker
 
         if future.status != "error":  # distributed cancels all futures when the connection to the scheduler is lost
@@ -472,8 +472,8 @@ Workers = Inline | Dask
 async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> Ref | None:
     """Run a call on a worker, which is ``ours`` or another's; give its artifact to the calls that wait for it.
 
-    What became of it leaves as an event of dask for the client of ``run``, which costs half of what fetching a result
-    does. Never an exception: dask would state it as the failure of every call that waits for this one.
+    Its outcome is sent to the client of ``run`` as an event of dask, at half the cost of fetching a result. It never
+    raises: dask would state the exception as the failure of every call that waits for this one.
     """
     from distributed import get_worker
 
@@ -486,17 +486,17 @@ async def work(pickled: bytes, made: list[Ref | None], run: str, ours: bool) -> 
 
 
 def _run(pickled: bytes, made: list[Ref | None], worker: str, ours: bool) -> tuple[bytes, Ref | None]:
-    """Run a call on a thread of a worker; the event of it, and its artifact, if it has one."""
+    """Run a call on a thread of a worker; return its event, and its artifact, if there is one."""
     _prepare(ours=ours)
     name, call = pickle.loads(pickled)
     ended = call.run({number: ref for number, ref in zip(call.upstream(), made, strict=True) if ref is not None})
     if isinstance(ended, Outcome):
         ended = replace(ended, took=replace(ended.took, worker=worker))
     # Events travel as msgpack, which has no types of ours: bytes pass.
-    return pickle.dumps((call.number, name, ended)), light(ended.ref) if isinstance(ended, Outcome) else None
+    return pickle.dumps((call.number, name, ended)), without_facts(ended.ref) if isinstance(ended, Outcome) else None
 
 
-def light(ref: Ref) -> Ref:
+def without_facts(ref: Ref) -> Ref:
     """Return a reference without its facts: a task reads them from the store, and those of a trajectory are large."""
     return replace(ref, meta={})
 

@@ -1,4 +1,4 @@
-"""Estimates compared with truth: of a recorded sequence only these tasks read the truth, and no estimate reads them.
+"""Comparisons with truth: only these tasks of a reconstruction read the truth, and no estimate reads them.
 
 ::
 
@@ -27,11 +27,11 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice, union
 
-Steps = Generator[Wait, Any, None]
+Flow = Generator[Wait, Any, None]
 
 
 def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
-    """Against the other program's, and both against truth where there is one."""
+    """Compare the trajectory with the other program's, and both with the truth, if there is one."""
     p, s = make.products, make.sequence
     if p.crosscheck is not None:
         p.agreement = make.node(agreement_stage, "agreement", trajectory=p.trajectory, crosscheck=p.crosscheck)
@@ -56,8 +56,8 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
             p.crosscheck_accuracy = make.node(accuracy_stage, "accuracy/crosscheck", trajectory=p.crosscheck, **known)
 
 
-def of_pair(make: Builder, pair: Pair) -> Steps:
-    """The disparity of a pair, and its local elevation model."""
+def of_pair(make: Builder, pair: Pair) -> Flow:
+    """Compare the disparity of a pair and its local elevation model with the truth."""
     exact_disparity = make.sequence.truth_disparity
     if exact_disparity is not None:
         true = make.source(exact_disparity(pair.frame), f"truth_disparity/{pair.frame}")
@@ -78,8 +78,8 @@ def of_pair(make: Builder, pair: Pair) -> Steps:
     )
 
 
-def of_world(make: Builder, pairs: Sequence[Pair]) -> Steps:
-    """The merged elevation model, and the path over it on the hazards of the exact one."""
+def of_world(make: Builder, pairs: Sequence[Pair]) -> Flow:
+    """Compare the merged elevation model with the truth; judge the path by the hazards of the exact model."""
     p, first = make.products, pairs[0]
     if make.sequence.truth_dem is None or _truth(make, first.frame) is None:
         return

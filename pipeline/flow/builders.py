@@ -1,7 +1,4 @@
-"""The parts of every flow: what reads what, from one image to a stereo pair, a segment, a world model and its hazards.
-
-Reconstruction, closed loop and check are made of these.
-"""
+"""Parts shared by all flows (reconstruction, closed loop, check): tasks of an image, pair, segment and world model."""
 
 from __future__ import annotations
 
@@ -65,7 +62,7 @@ PYRAMID_BYTES = 20 / 3
 
 @dataclass(frozen=True)
 class BasicPair:
-    """A basic pair: disparity, rig that it is reconstructed with, and vertical."""
+    """A basic pair: disparity, rig, and vertical with reference plane (``level``)."""
 
     frame: int
     disparity: Handle
@@ -82,7 +79,7 @@ class Pair(BasicPair):
 
 @dataclass(frozen=True)
 class Segment:
-    """Left images from one basic pair on: their frames, tracks, and poses in the frame of that pair."""
+    """Left images from one basic pair to the next: frames, tracks, and poses in the frame of the first."""
 
     frames: tuple[int, ...]
     track: Handle[TrackFacts]
@@ -90,7 +87,7 @@ class Segment:
 
 
 def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Builder, P], T]:
-    """Method of :class:`Builder` that for the same arguments gives what it gave before."""
+    """Make a method of :class:`Builder` return the same task for the same arguments."""
 
     def made(self: Builder, /, *args: P.args, **kwargs: P.kwargs) -> T:
         # Arguments are numbers and names: equal ones mean the same task, whoever asks for it.
@@ -103,13 +100,13 @@ def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Bui
     return made
 
 
-def name(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
-    """Say what a graph works on: hints of earlier runs are kept by it."""
+def name_graph(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
+    """Name a graph by its sequence and frames: hints of earlier runs are kept by these names."""
     graph.sequence, graph.choice = sequence.name, digest(tuple(frames))[:16]
 
 
 def recalibrated(sequence: Sequence, correction: Series[float]) -> Sequence:
-    """The sequence with a correction of its cameras and its rig's yaw, as stage ``intrinsics`` gives it."""
+    """The sequence with its cameras and its rig's yaw corrected as stage ``intrinsics`` says."""
     lenses = (sequence.lenses or {}).items()
     return replace(
         sequence,
@@ -160,14 +157,14 @@ class Builder:
         return self.graph.call(stage, label, chosen, **given)
 
     def recalibrate(self, correction: list[float], since: int) -> None:
-        """Go on with the calibration corrected; what does not rest on it is the same task as before."""
+        """Correct the calibration; tasks that do not depend on it are laid out as before."""
         self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
-        self.again(since)
+        self.discard(since)
         for cached in ("given_rig", "given_lenses"):
             self.__dict__.pop(cached, None)
 
-    def again(self, since: int) -> None:
-        """The tasks laid out ``since`` a number are of no account any more, unless they are laid out again."""
+    def discard(self, since: int) -> None:
+        """Mark the tasks from number ``since`` on as outdated, unless they are laid out again."""
         self.graph.outdated |= set(range(since, len(self.graph.nodes)))
         self.made.clear()
         self.products.contradictions.clear()
@@ -177,7 +174,7 @@ class Builder:
     def source(
         self, source: Source, label: str, given: Mapping[str, Handle] | None = None, expect: float = 0.0
     ) -> Handle:
-        """Task of a source, with those of what it needs; ``given`` are inputs that are there already."""
+        """Task of a source, with the tasks of its inputs; ``given`` are inputs that exist already."""
         inputs = {
             port: self.source(upstream, f"{label}/{port}") if upstream.args else self._shared(upstream)
             for port, upstream in source.inputs.items()
@@ -187,7 +184,7 @@ class Builder:
         )
 
     def _shared(self, source: Source) -> Handle:
-        """What is the same for all frames (a rendered scene) is made once."""
+        """Task of a source that all frames share (a rendered scene), made once."""
         label = source.module.rsplit(".", 1)[-1]
         if label not in self.made:
             self.made[label] = self.source(source, label)
@@ -195,7 +192,7 @@ class Builder:
         return found
 
     @once
-    def taken(self, frame: int, camera: str) -> Handle:
+    def raw_image(self, frame: int, camera: str) -> Handle:
         """One image as the camera took it."""
         ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
         grey = 4.0 * ideal.width * ideal.height  # float32
@@ -204,7 +201,7 @@ class Builder:
     @once
     def image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""
-        image = self.taken(frame, camera)
+        image = self.raw_image(frame, camera)
         if camera == "left":
             self.products.images[frame] = image
         lens = (self.sequence.lenses or {}).get(camera)
@@ -240,7 +237,7 @@ class Builder:
         images = {camera: self.image(frame, camera) for camera in CAMERAS}
         return self.node(image_quality_stage, f"image_quality/{frame}", **images, frame=frame)
 
-    # -- what two images show -----------------------------------------------------------------------------------
+    # -- two images --------------------------------------------------------------------------------------------
 
     @once
     def motion(self, a: int, b: int) -> Handle[MotionFacts]:
@@ -249,15 +246,14 @@ class Builder:
         return self.node(motion_stage, f"motion/{a}-{b}", **images)
 
     @once
-    def sides(self, frame: int) -> Handle[SwapFacts]:
-        """Whether the images of a pair are exchanged."""
+    def swap_check(self, frame: int) -> Handle[SwapFacts]:
+        """Whether left and right of a pair are exchanged."""
         images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
 
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
-        """Which right images, of those of some frames about each pair, are of the time of the left ones."""
+        """For each pair, the right image of the same time as the left one, among the three frames on either side."""
         at = [frames.index(pair) for pair in pairs]
-        # Frames before and behind a pair whose right images may be of its time
         near = [f for k, f in enumerate(frames) if any(abs(k - place) <= 3 for place in at)]
         images = {"left": [self.features(f, "left") for f in pairs], "right": [self.features(f, "right") for f in near]}
         return self.node(synchrony_stage, label, **images, pairs=list(pairs), frames=near, rig=self.given_rig)
@@ -294,13 +290,13 @@ class Builder:
 
     @once
     def orientation(self, pair: int) -> Handle[OrientationFacts]:
-        """Relative orientation that the disparity of a pair asks for."""
+        """Relative orientation of the cameras by the disparity of a pair."""
         known = {"disparity": self.disparity(pair), "rig": self.given_rig}
         known |= {camera: self.image(pair, camera) for camera in CAMERAS}
         return self.node(orientation_stage, f"orientation/{pair}", **known, pair=pair)
 
     def rig(self, pairs: Series[int], which: str = "") -> tuple[Handle[RigFacts], Handle[CalibrationFacts]]:
-        """The rig that the orientations of these pairs agree on, and what of it other stages read."""
+        """The rig that the orientations of these pairs agree on, and the part of it that other stages read."""
         orientations = [self.orientation(pair) for pair in pairs]
         first = None if self.correction is None else self.uncorrected.rig.to_dict()
         given = {"rig": self.given_rig, "first": first, "lenses": self.given_lenses}
@@ -360,7 +356,7 @@ class Builder:
         )
 
     def _seen(self, frame: int) -> dict[str, Handle | None]:
-        """Images and disparity of a pair, and the disparity of its right image where that is wanted."""
+        """Images and disparity of a pair, and with ``locus.both`` the disparity of its right image."""
         return {
             "disparity": self.disparity(frame),
             "left": self.pyramid(frame, "left"),

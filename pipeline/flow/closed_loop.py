@@ -24,8 +24,8 @@ Pair, world model, segment and hazards are those of a reconstruction (:mod:`rill
              stop k+1 at the last image, or at the one where a monitor stopped
 
 Only ``drive``, ``sense`` and the images know the true poses. The vehicle's own estimate is the trajectory:
-the product of the segments that were tracked and resected. Every node is keyed by what it reads, so a drive that is
-killed goes on where it was, and one that is repeated computes nothing.
+the product of the segments that were tracked and resected. A killed drive goes on where it was; a repeated one computes
+nothing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from rille.datasets.protocol import Sequence, Simulation
 from rille.datasets.text.count import count
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.flow.builders import Builder, Pair, Segment, name
+from rille.pipeline.flow.builders import Builder, Pair, Segment, name_graph
 from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
@@ -71,7 +71,7 @@ Sigma = Annotated[float, Field(ge=0)]
 
 
 class DriveParams(Params):
-    """The loop itself; what happens on a leg and at a stop is the stages' own."""
+    """Parameters of the loop; those of a stop and of a leg are in the sections of their stages."""
 
     goal: tuple[float, float] | None = Field(
         default=None, description="x, y [m] of the goal, in the frame that drive.frame names"
@@ -187,7 +187,7 @@ class Drive:
         return self.products
 
     def steps(self) -> Generator[Wait, Any, None]:
-        """The drive, and how it is assessed."""
+        """The drive, and its assessment."""
         try:
             yield from self.legs()
         except EndedError as end:
@@ -244,7 +244,7 @@ class Drive:
         return stop
 
     def _fix(self) -> Handle[MapFixFacts]:
-        """Where the first pair is in the global map: handed in, or found by its elevation model."""
+        """Pose of the first pair in the global map: as given, or by its elevation model."""
         d, given = self.config.drive, dict[str, Any]()
         if d.pose is not None:
             given["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
@@ -266,7 +266,7 @@ class Drive:
         self.goal = self._on_ground(float(x), float(y))
 
     def _on_ground(self, x: float, y: float) -> tuple[float, float]:
-        """A goal in the world frame, where there is ground."""
+        """Return a goal in the world frame; refuse one beside the ground."""
         x_min, x_max, y_min, y_max = self.simulation.ground
         if not (x_min <= x <= x_max and y_min <= y <= y_max):
             raise ConfigError(
@@ -278,7 +278,7 @@ class Drive:
         return x, y
 
     def _map(self, stop: Stop) -> Handle:
-        """What is known of the world at a stop, and its hazards; how high the ground may be."""
+        """Merge the models so far and judge their hazards; return the upper bounds of the ground."""
         p, make, k = self.products, self.make, stop.index
         found, row = self._located(k), len(self.posed) - 1
         pose, p.world_dem[stop.frame] = make.world_model(self.pairs[k], self.pairs[0], row, found)
@@ -306,7 +306,7 @@ class Drive:
         return self._ceiling(f"occlusion_bounds/{k}", near, finest)
 
     def _located(self, legs: int) -> Handle[TrajectoryFacts]:
-        """The trajectory over so many legs, which is that of the drive from now on."""
+        """The trajectory over so many legs, which becomes that of the drive."""
         p = self.products
         levels = [pair.level for pair in self.pairs]
         found = p.trajectory = self.make.node(
@@ -319,13 +319,13 @@ class Drive:
         return found
 
     def _merged(self, label: str, finest: float | None) -> Handle[MergeFacts]:
-        """All that was seen so far, or what of it a pixel covers ``finest`` metres of at most."""
+        """All models so far, merged; with ``finest`` only ground of which a pixel covers at most so many metres."""
         params = self.config.merge.model_copy(update={} if finest is None else {"max_footprint": finest})
         dems = [*self.pads, *self.products.world_dem.values()]
         return self.make.node(merge_stage, label, params, dems=dems, lattice=self.arena().to_dict())
 
     def _ceiling(self, label: str, merged: Handle, finest: float | None) -> Handle:
-        """How high the ground may be, also where it was not seen."""
+        """Upper bounds of the ground, also where it was not seen."""
         params = self.config.occlusion_bounds.model_copy(update={} if finest is None else {"max_footprint": finest})
         dems = list(self.products.world_dem.values())
         return self.make.node(occlusion_bounds_stage, label, params, merged=merged, dems=dems)
@@ -335,7 +335,7 @@ class Drive:
         return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
 
     def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
-        """Plan the next leg by what is known at a stop, anew where a way turns out to be closed."""
+        """Plan the next leg; plan again while a way turns out to be closed."""
         known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
         follows, label, thoughts = "again", f"leg/{stop.index}", 0
         while follows == "again":
@@ -363,7 +363,7 @@ class Drive:
     # -- a leg --------------------------------------------------------------------------------------------------
 
     def _drive(self, stop: Stop, at: TrueStand) -> Generator[Wait, Any, Way]:
-        """The true motion, what the sensors say of it, and the images on the way that are not lost."""
+        """True motion of a leg, measurements of its sensors, and the images on the way that are not lost."""
         k, s, make = stop.index, self.simulation, self.make
         assert stop.leg is not None
         given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": stop.leg}
@@ -407,7 +407,7 @@ class Drive:
         return [f for f in frames if f not in lost]
 
     def _judge(self, stop: Stop, way: Way) -> Generator[Wait, Any, TrueStand]:
-        """Track and resect the images of a leg: it is over at its end, or where a safety stop or an obstacle was."""
+        """Track and resect the images of a leg, up to its end, a safety stop or an obstacle; return where it ended."""
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
         segment = self.make.segment(frames, key)
         safe = self.make.node(
@@ -449,7 +449,7 @@ class Drive:
         return TrueStand(end, stop.drive, rows[end], way.said.meta["up"][rows[end]])
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
-        """Whether the images on the way show what the last model does not."""
+        """Compare the images on the way with the last model, for obstacles that it lacks."""
         frames = way.frames
         wheels = np.array([way.said.meta["odometry"][way.rows[f]] for f in frames])
         compared = obstacle_monitor.pairs(wheels, self.config.vehicle.wheel_diameter)
@@ -473,7 +473,7 @@ class Drive:
     # -- the end ------------------------------------------------------------------------------------------------
 
     def _assess(self) -> Generator[Wait, Any, None]:
-        """The drive against the truth: here alone truth and estimates meet."""
+        """Compare the drive with the truth; nothing else compares them."""
         p, make = self.products, self.make
         if not self.pairs or p.trajectory is None or _failed(self.pairs[0].level) or _failed(p.trajectory):
             p.trajectory = None  # it failed at its first stop
@@ -493,12 +493,12 @@ class Drive:
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 
     def _closed(self) -> str:
-        """Why there is no way, in words, where the last leg was a look around for that; empty where there was one."""
+        """Why there is no way, in words, if the last leg was a look around for that reason; else empty."""
         legs = [s.leg.ref.meta for s in self.driven.stops if s.leg is not None and s.leg.ref is not None]
         return str(legs[-1]["reason"]) if legs and legs[-1]["verdict"] == "look" and not legs[-1]["way_m"] else ""
 
     def _check(self, known: dict[str, Any]) -> None:
-        """The legs that were driven, against the truth."""
+        """Compare the driven legs with the truth."""
         d = self.driven
         legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]
         assert d.place is not None
@@ -520,8 +520,8 @@ class Drive:
             return "safety stop", f"{failed.label}: {failed.error.message}"
         return "failed", "" if failed is None else f"{failed.label}: {failed.error}"
 
-    def taken(self) -> tuple[Sequence, tuple[int, ...]]:
-        """The sequence as it came about, and the frames that have a pose in it."""
+    def recorded(self) -> tuple[Sequence, tuple[int, ...]]:
+        """The sequence as the drive recorded it, and its frames that have a pose."""
         n = max(self.true, default=0) + 1
         truth = tuple(RigidTransform.from_matrix(self.true[f]) if f in self.true else None for f in range(n))
         names = tuple(f"{f:06d}" for f in range(n))
@@ -529,13 +529,13 @@ class Drive:
 
 
 class DriveBuilder(Builder):
-    """Tasks of a drive: an image is taken where the vehicle truly is by then, by an ideal camera."""
+    """Tasks of a drive: an ideal camera takes each image from the true pose of the vehicle."""
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any, drive: Drive) -> None:
         super().__init__(graph, sequence, config)
         self.drive = drive
 
-    def taken(self, frame: int, camera: str) -> Handle:
+    def raw_image(self, frame: int, camera: str) -> Handle:
         """One image of the scene as it is now, from the true pose of the frame."""
         pose = RigidTransform.from_matrix(self.drive.true[frame])
         source = self.drive.simulation.image(frame, camera, pose)
@@ -548,8 +548,8 @@ def _failed(handle: Handle) -> bool:
 
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> tuple[Products, Drive | None]:
-    """Start what suits a sequence: the reconstruction of a recorded one, or a drive; what it delivers."""
-    name(graph, sequence, frames)
+    """Lay out the reconstruction of a recorded sequence, or a drive in a simulated one; return its products."""
+    name_graph(graph, sequence, frames)
     if sequence.simulation is not None:
         drive = Drive(graph, sequence, config)
         return drive.build(), drive

@@ -34,13 +34,13 @@ So many points because models that are half as wrong show half as small an error
 """
 
 
-OF_BOTH: dict[str, Any] = {"locus": {"refined_share": 0.5}}
-"""What it sets besides where the matcher is accurate: the mean of what the disparity says and of what the images show
-is better than either."""
+ACCURATE_REFINEMENT: dict[str, Any] = {"locus": {"refined_share": 0.5}}
+"""What it sets besides if the matcher is accurate: the mean of the elevations by disparity and by refinement is better
+than either."""
 
-OF_FAST: dict[str, Any] = {"locus": {"refine_steps": 6}}
-"""What ``hfvm.preset = "fast"`` sets besides: its disparities err more, and two steps take less of that away (errors of
-merged elevations of three beds .87 to .91 times those after two, within one standard deviation .68 instead of .56)."""
+FAST_REFINEMENT: dict[str, Any] = {"locus": {"refine_steps": 6}}
+"""What ``hfvm.preset = "fast"`` sets in other sections: two steps leave more of its larger errors (after six, errors of
+merged elevations of three beds are .87 to .91 times those, within one standard deviation .68 instead of .56)."""
 
 NAVIGATION: dict[str, Any] = {
     "hfvm": {"preset": "fast"},
@@ -50,7 +50,7 @@ NAVIGATION: dict[str, Any] = {
 }
 """What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there.
 
-What a trajectory needs of disparities and displacements, half the resolution of each gives.
+Half the resolution of disparities and displacements is enough for a trajectory.
 """
 
 
@@ -218,9 +218,9 @@ def build(*layers: Mapping[str, Any]) -> Params:
     if _preset(nested, "terrain") == "accurate":
         nested = _beneath(nested, ACCURATE_TERRAIN)
         if _preset(nested, "hfvm") == "accurate":
-            nested = _beneath(nested, OF_BOTH)
+            nested = _beneath(nested, ACCURATE_REFINEMENT)
     if _preset(nested, "hfvm") == "fast":
-        nested = _beneath(nested, OF_FAST)
+        nested = _beneath(nested, FAST_REFINEMENT)
     if _preset(nested, "keyframes") == "navigation":
         nested = _beneath(nested, NAVIGATION)
     return validate(model(), nested, also=DATASET_SECTIONS)
@@ -232,7 +232,7 @@ def _preset(nested: Mapping[str, Any], section: str) -> Any:
 
 
 def _beneath(nested: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
-    """A preset beneath what is given: whatever the user gives for one of its keys wins."""
+    """A preset beneath the given values, which win."""
     return merge(merge({}, preset), nested)
 
 

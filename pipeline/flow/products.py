@@ -14,7 +14,7 @@ class Stop:
 
     Attributes
     ----------
-    row : of the leg's artifact, where the leg ended: the last one, unless something ended it before.
+    row : row of the leg's artifact at which the leg ended; the last one, unless something ended it before.
     """
 
     index: int
@@ -46,7 +46,7 @@ class Products:
 
     Attributes
     ----------
-    chained : the trajectory before it was adjusted to loops; None: it was not.
+    chained : the trajectory before its adjustment to loops and sensors; None: there was none.
     """
 
     images: dict[int, Handle] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The dataflow, top to bottom: what is computed from what. Draw it from this file.
+"""The dataflow of a reconstruction, top to bottom.
 
 ::
 
@@ -27,20 +27,20 @@
     leaves:  accuracy (trajectory, crosscheck), position_accuracy, disparity_accuracy, dem_accuracy, path_check
     outputs: rasters, tracks, tables, figures: a task each; then report.html and report.json around them
 
-Frames that show no motion (black, of another scene, left and right exchanged) are lost: ``frame_screening`` finds them
-by their ``image_quality``, by motions and bridges over a lost frame, and by ``swap_check`` (left against right). Pairs
-whose rows the rig does not explain go through ``synchrony`` (right images of other times): those of two times are not
-basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: behind a rig that was
-knocked nothing is posed.
+A *basic pair* is a stereo pair that is matched and gets an elevation model; a *segment* is the run of left images from
+one basic pair to the next. A *lost* frame has no usable image (black, of another scene, left and right exchanged):
+``frame_screening`` finds it by ``image_quality``, by motions, by bridges (motions over it), and by ``swap_check``.
+``synchrony`` compares pairs whose rows the rig does not explain with right images of other times; pairs of two times
+are not basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: after a knock of
+the rig no frame gets a pose.
 
-A segment needs landmarks only relative to its own basic pair, so all segments are resected in parallel, and
-``trajectory`` chains them; ``intrinsics`` asks all of them for errors of the calibration, whose covariance it needs.
-Where the cameras are wrong, all that rests on them is laid out anew with corrected ones. Where other sensors are
-measurements (dead reckoning, GNSS, attitude) all poses are adjusted to them together: ``adjust``. Locus then runs a
-second time, directly on the shared world lattice, so nothing is resampled. With ``locus.both`` it reads the disparities
-of both images (``hfvm/back``). What depends on data (which pairs are basic, how far the world reaches) follows as
-results arrive: ``reconstruction`` is a generator that yields tasks and goes on with their results. Ports of single
-stages are in ``builders``, the leaves in ``assessment``; outputs are added last, by
+The landmarks of a segment are relative to its own basic pair, so all segments are resected in parallel, and
+``trajectory`` chains them. ``intrinsics`` estimates errors of the calibration from all segments; if it corrects the
+cameras, all tasks that depend on them are laid out anew. ``adjust`` fits all poses to loops and to other sensors (dead
+reckoning, GNSS, attitude). Locus then runs a second time, directly on the shared world lattice, so nothing is
+resampled. With ``locus.both`` it reads the disparities of both images (``hfvm/back``). ``reconstruction`` is a
+generator: it yields tasks and goes on with their results, because these decide which pairs are basic and how far the
+world reaches. Inputs of single stages are in ``builders``, the leaves in ``assessment``; outputs are added last, by
 :mod:`rille.pipeline.runs.run_files`.
 
 The world is divided into fixed tiles. The task of a tile reads only the models that have a cell in it. If a pair is
@@ -102,23 +102,23 @@ TILE_CELLS = 512
 """Side of a world tile, cells: 512 x 512 float32 is 1 MiB an array, small enough to recompute alone."""
 
 
-CALIBRATIONS = 6
-"""Corrections of the calibration, at most: of a focal length that is 10 % off one to three are usual, of a yaw that is
-half a degree off two."""
+MAX_CALIBRATIONS = 6
+"""Corrections of the calibration: one to three are usual for a focal length that is 10 % off, two for a yaw that is
+half a degree off."""
 
-ODD = (
+MISFIT = (
     "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
 )
-"""Cause of a frame that is lost by its rig."""
+"""Cause of a lost frame: its rig differs from that of its neighbours."""
 
 TORN = "it shows two motions, and without it the frames beside it show one: its images are torn, or something passed by"
-"""Cause of a frame that is lost by its motions."""
+"""Cause of a lost frame: its landmarks show two motions."""
 
-Steps = Generator[Wait, Any, None]
+Flow = Generator[Wait, Any, None]
 Facts = Mapping[str, Any]
 
 
-def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
+def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
     """Lay out the reconstruction of the chosen frames, in order.
 
     Raises
@@ -141,7 +141,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
     make.orientation(whole[0])
     if make.config.crosscheck.enabled and len(whole) > 1:
         # What is laid out first runs first: its windows take longest of all tasks.
-        p.crosscheck = another_program(make, whole)
+        p.crosscheck = crosscheck_tasks(make, whole)
     # Features also tell places that are seen again; where the crosscheck is wanted, it has them all.
     yield Complete(("crosscheck", "crosscheck_join", *(("features",) if make.config.crosscheck.enabled else ())))
 
@@ -165,7 +165,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
         levels=[matched[s.frames[0]].level for s in segments] or [first.level],
         intrinsics=p.intrinsics,
         frames=list(frames),
-        steps=steps_of(make, chosen),
+        steps=step_measures(make, chosen),
         lost=sorted([*missing, *fitting.lost], key=lambda item: item["frame"]) or None,
     )
     yield from adjusted(make, frames, list(pairs.values()))
@@ -179,9 +179,9 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Steps:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Basic pairs that fit each other, as they are chosen and ``matched``, and the tracks behind them.
+    """Basic pairs that fit each other, with their disparities (``matched``) and the tracks from each to the next.
 
-    ``lost``: frames (frame and cause); ``moved``: pairs before which the rig was knocked.
+    ``lost``: frames (frame and cause); ``moved``: pairs after a knock of the rig.
     """
 
     choice: Choice
@@ -196,14 +196,13 @@ def tracked(
 ) -> Generator[Wait, Any, Tracked | None]:
     """Match the basic pairs and track between them; None where nothing can be measured.
 
-    While tracks contradict images, go on without these; while they contradict the cameras, lay out anew with corrected
-    ones all that rests on these.
+    Repeat without the images, or with corrected cameras, that the tracks contradict.
     """
-    p, turn, since = make.products, 0, len(make.graph.nodes)
+    p, attempt, since = make.products, 0, len(make.graph.nodes)
     torn: dict[int, str] | None = None
     while True:
-        if turn and p.crosscheck is not None:
-            p.crosscheck = another_program(make, whole)
+        if attempt and p.crosscheck is not None:
+            p.crosscheck = crosscheck_tasks(make, whole)
         found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
         choice = found.choice
         if choice is None:
@@ -211,28 +210,28 @@ def tracked(
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
         matched = yield from matched_pairs(make, choice.rigs)
 
-        # Behind each basic pair: tracks, and poses in its frame. A frame is known by its place in the chain.
-        ways = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
-        segments = [make.segment(way, matched[way[0]], after=matched.get(way[-1])) for way in ways]
-        segments, moved = yield from unmoved(make, matched, segments)
+        # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
+        runs = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
+        segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
+        segments, moved = yield from refuse_knocked(make, matched, segments)
         p.resections = [s.resection for s in segments]
-        wanted = suspected(segments, found.chain) if torn is None else kept_out(segments, found.chain, torn)
+        wanted = suspects(segments, found.chain) if torn is None else confirmed(segments, found.chain, torn)
         if wanted != (torn or {}):
             torn = wanted
-            make.again(since)
+            make.discard(since)
             continue
         key = matched[choice.basic[0]]
-        asked = (yield from asked_for(make, key)) if segments and make.config.resect.joint else None
-        if asked is None or turn == CALIBRATIONS:
+        correction = (yield from corrected_calibration(make, key)) if segments and make.config.resect.joint else None
+        if correction is None or attempt == MAX_CALIBRATIONS:
             if p.intrinsics is not None:
                 p.contradictions.append(p.intrinsics)
             return Tracked(choice, found.lost, matched, segments, moved)
-        make.recalibrate(asked["corrected"], since)
-        turn += 1
+        make.recalibrate(correction["corrected"], since)
+        attempt += 1
 
 
-def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], posed: Ref[TrajectoryFacts]) -> Steps:
-    """The largest piece of the trajectory: its models straight on the world lattice, merged; hazards and the path.
+def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], posed: Ref[TrajectoryFacts]) -> Flow:
+    """Lay out the world of the trajectory's largest piece: models on the world lattice, merged; hazards; the path.
 
     Raises
     ------
@@ -245,16 +244,16 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     row = {frame: k for k, frame in enumerate(frames)}
     start, end = posed.meta["pieces"][posed.meta["main"]]
     world = set(posed.meta.get("world", range(start, end + 1)))
-    # Pairs of other pieces have poses in frames of their own: nothing says where they lie in this world.
+    # Pairs of other pieces have poses in frames of their own, whose place in this world is unknown.
     there = [k for k in pairs if k in world and positions[k]]
     for k in there:
         _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
-    prints = [
+    indexed = [
         make.node(tile_index_stage, f"tile_index/{k}", dem=dem, side=TILE_CELLS) for k, dem in p.world_dem.items()
     ]
     yield Complete(("moving", "pose", "locus", "tile_index"))
     # A pair whose model failed is left out of the world: the others make a map with a hole.
-    laid = yield Maybe(prints)
+    laid = yield Maybe(indexed)
     footprints = [ref.meta for ref in laid if ref is not None and ref.meta["tiles"]]
     if not footprints:
         remedy = "set locus.cell_size greater, or look at the disparities' validity"
@@ -267,8 +266,8 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     centres = {str(f["pair"]): centre(f["box"]) for f in footprints if f["box"] is not None}
     yield Complete(("overlap_qa", "overlap_audit"))
     levelled = yield from done(make.node(radiometry_stage, "radiometry", seams=seams, centres=centres))
-    unsure: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics] if p.intrinsics else [])
-    rig_error = unsure[0].meta.get("inverse_depth_std") if unsure and unsure[0] else None
+    intrinsics: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics] if p.intrinsics else [])
+    rig_error = intrinsics[0].meta.get("inverse_depth_std") if intrinsics and intrinsics[0] else None
     p.world_tiles = merge_tiles(make.node, footprints, p.world_dem, levelled.meta["steps"], rig_error)
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
@@ -278,8 +277,8 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     yield from assessment.of_world(make, [pairs[k] for k in there])
 
 
-def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
-    """Motions along some frames in tables, cut by frame numbers: where a frame is left out, the other tables stay."""
+def step_tables(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
+    """Tables of the motions along some frames, cut by frame numbers: if a frame is left out, the other tables stay."""
     made: dict[tuple[int, ...], list[Handle[StepTableFacts]]] = make.made.setdefault("steps", {})
     if tuple(frames) not in made:
         taken = "step_table/bridged" if made else "step_table"
@@ -292,19 +291,19 @@ def steps(make: Builder, frames: list[int]) -> list[Handle[StepTableFacts]]:
 
 
 def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[Wait, Any, Ref[ScreeningFacts]]:
-    """Ask which frames are lost; while more is to be known for the answer, find that and ask again.
+    """Determine the lost frames; add the motions and swap checks that the screening asks for until it asks for none.
 
-    ``timed``: compare left and right of all frames, not only where the images ask for it.
+    ``timed``: compare left and right of all frames, not only of those that it asks for.
     """
     qualities = [make.quality(frame) for frame in whole]
-    along = steps(make, whole)
+    along = step_tables(make, whole)
     bridges: dict[tuple[int, int], Handle] = {}
-    sides = {frame: make.sides(frame) for frame in whole} if timed else dict[int, Handle]()
-    which, turn = "/timed" if timed else "", 0
+    sides = {frame: make.swap_check(frame) for frame in whole} if timed else dict[int, Handle]()
+    which, attempt = "/timed" if timed else "", 0
     while True:
         asked = make.node(
             frame_screening_stage,
-            f"frame_screening{which}/{turn}" if turn else f"frame_screening{which}",
+            f"frame_screening{which}/{attempt}" if attempt else f"frame_screening{which}",
             frames=whole,
             bridged=list(bridges) or None,
             qualities=qualities,
@@ -318,14 +317,16 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
             make.products.screening = asked
             return found
         bridges |= {(a, b): make.motion(a, b) for a, b in asks["bridges"]}
-        sides |= {frame: make.sides(frame) for frame in asks["sides"]}
-        turn += 1
+        sides |= {frame: make.swap_check(frame) for frame in asks["sides"]}
+        attempt += 1
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Basic pairs, the rig of each, and the facts of these rigs; ``suspects`` are pairs of doubtful rows, and ``which``
-    ends the labels of its tasks."""
+    """Basic pairs, the rig of each, and the facts of these rigs.
+
+    ``suspects``: pairs whose rows the rig does not explain; ``which``: end of the labels of its tasks.
+    """
 
     which: str
     keyframes: Ref[KeyframesFacts]
@@ -338,9 +339,9 @@ class Choice:
 def basic_pairs(
     make: Builder, chain: list[int], unfit: set[int], behind: list[int], mode: str
 ) -> Generator[Wait, Any, Choice]:
-    """Choose basic pairs of a ``chain`` of frames, and find their rigs: one for all pairs, or one each (``mode``).
+    """Choose basic pairs of a ``chain`` of frames, and estimate their rigs: one for all pairs, or one each (``mode``).
 
-    No ``unfit`` frame is basic; ``behind`` are places in the chain behind a frame that has no pose.
+    No ``unfit`` frame is basic; ``behind``: places in the chain after a frame that has no pose.
     """
     p = make.products
     # Each contradiction leads to another choice.
@@ -348,7 +349,7 @@ def basic_pairs(
     p.keyframes = make.node(
         keyframes_stage,
         f"keyframes{which}",
-        steps=steps(make, chain),
+        steps=step_tables(make, chain),
         frames=len(chain),
         unfit=[k for k, f in enumerate(chain) if f in unfit] or None,
         behind=behind or None,
@@ -364,28 +365,27 @@ def basic_pairs(
     return Choice(which, chosen, basic, known, judged, suspects)
 
 
-def of_other_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
-    """Compare pairs of doubtful rows with right images of other times."""
-    # 12: pairs that are compared at once.
+def compare_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
+    """Compare suspect pairs, 12 at most, with right images of other times."""
     asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
     make.products.contradictions.append(asked)
     return (yield from done(asked))
 
 
 def misfits(choice: Choice, mode: str) -> set[int]:
-    """Pairs that do not fit the rig as their neighbours do; none where many pairs do not: these bend the rig itself."""
+    """Pairs that do not fit the rig though their neighbours do; none if many do not: these bend the rig itself."""
     basic, facts = choice.basic, [rig.meta.get("per_pair", ()) for rig in choice.judged]
     fitting = {one["pair"] for pairs in facts for one in pairs}.difference(choice.suspects)
     bad = set(basic if mode == "per_pair" else representative(basic)) - fitting
-    # A rig that moved did so for the next pairs, too.
+    # If the rig had moved, the next pair would not fit, either.
     alone = {b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}}
     return alone if 4 * len(bad) <= len(basic) else set()
 
 
 @dataclass(frozen=True)
 class Simultaneous:
-    """Frames of the ``chain``, those that are ``lost`` (frame and cause), and the choice of basic pairs, None where
-    nothing can be measured."""
+    """Frames of the ``chain``, ``lost`` frames (frame and cause), and the choice of basic pairs (None: nothing can be
+    measured)."""
 
     chain: list[int]
     lost: list[dict[str, Any]]
@@ -395,11 +395,11 @@ class Simultaneous:
 def simultaneous(
     make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
 ) -> Generator[Wait, Any, Simultaneous]:
-    """Choose basic pairs; while their rigs or images contradict each other, lose what does so and choose again.
+    """Choose basic pairs; leave out those whose rigs or images contradict the others, and choose again.
 
-    Frames are lost as they were ``found`` to be, or are anew where some are of two times, where they are ``odd`` (cause
-    by frame), and where left and right do not fit each other as those of their neighbours do. No choice where the
-    images of most pairs contradict the rig, or each other: nothing is measured with these then.
+    Frames are lost that the screening ``found``, that are ``odd`` (cause by frame), and whose left and right images do
+    not fit each other though those of their neighbours do. If some pairs are of two times, all frames are screened
+    again. No choice if the images of most pairs contradict the rig, or each other.
     """
     p, mode, wrong = make.products, make.config.rig.mode, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
@@ -409,13 +409,13 @@ def simultaneous(
         behind = [k for k, (a, b) in enumerate(pairwise(chain), 1) if row[b] > row[a] + 1]
         late = found.meta.get("late", [])
         if late and not p.contradictions:
-            p.contradictions.append(lost_by_time(make, late, whole))
+            p.contradictions.append(synchrony_of_late(make, late, whole))
         choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
         if choice.suspects:
-            apart = yield from of_other_times(make, choice, chain)
+            apart = yield from compare_times(make, choice, chain)
             partners = apart.meta["partners"]
             if partners and not timed:
-                # Of all frames, and not of some basic pairs: behind a lost image no pair is of one time.
+                # All frames, not basic pairs alone: after a lost image no pair is of one time.
                 timed = True
                 again = yield from screened(make, whole, timed)
                 if again.meta["lost"] != found.meta["lost"]:
@@ -425,10 +425,10 @@ def simultaneous(
                     continue
             contradicted = any("contradiction" in one.meta for one in (apart, *choice.judged))
             if contradicted and 2 * len(choice.suspects) > len(choice.basic):
-                # A rig that images of two times show is none: a camera that moves in it did not.
+                # Images of two times show no rig: the change between them is not that of a camera that moved in it.
                 p.rigs = {} if partners else p.rigs
                 if late and partners:
-                    p.contradictions[:] = [lost_by_time(make, sorted({*late, *(k for k, _ in partners)}), whole)]
+                    p.contradictions[:] = [synchrony_of_late(make, sorted({*late, *(k for k, _ in partners)}), whole)]
                 return Simultaneous(chain, lost, None)
             if partners:
                 wrong |= {pair for pair, _ in partners}
@@ -437,7 +437,7 @@ def simultaneous(
         alone = set[int]() if late else misfits(choice, mode)
         if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= dict.fromkeys(alone, ODD)
+            odd |= dict.fromkeys(alone, MISFIT)
         elif any("knocked" in one.meta for one in choice.judged):
             p.contradictions.append(p.rigs[choice.basic[0]])
             # One calibration does not describe this rig: each pair has its own.
@@ -447,17 +447,16 @@ def simultaneous(
 
 
 def resected(segments: list[Segment]) -> list[ResectFacts]:
-    """Facts of the segments; a plan may have none."""
+    """Facts of the resected segments; a plan may have none."""
     return [s.resection.ref.meta for s in segments if s.resection.ref is not None]
 
 
-def suspected(segments: list[Segment], chain: list[int]) -> dict[int, str]:
-    """Frames to go on without, and why.
+def suspects(segments: list[Segment], chain: list[int]) -> dict[int, str]:
+    """Frames to try without, each with the cause.
 
-    Left and right of a pair do not fit each other where a part of its disparities departs from the landmarks' (in few
-    pairs: many do so where matches are bad). Two motions are shown by the first of the frames whose landmarks show
-    them, or the one before it, in which many landmarks were lost; and by a basic pair that part of the landmarks
-    contradicts, those before it and its own.
+    ``MISFIT``: a pair part of whose disparities departs from those of its landmarks; none if many pairs do, as with bad
+    matches. ``TORN``: the first of the frames whose landmarks show two motions, or the one before it if many landmarks
+    were lost there; and a basic pair that many landmarks contradict in its own segment and in the one before.
     """
     metas = resected(segments)
     parts = [meta["per_frame"] for meta in metas if meta.get("per_frame")]
@@ -473,25 +472,25 @@ def suspected(segments: list[Segment], chain: list[int]) -> dict[int, str]:
     # 0.7: of the landmarks that were found: in sound images 0.9 agree, by night 0.7.
     split = {one["frame"] for one in behind_key if one["inliers"] < 0.7 * one["landmarks"]}
     pairs = [part[0]["frame"] for part in parts if {one["frame"] for one in part[:2]} <= split]
-    return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, ODD)
+    return dict.fromkeys([*(a if a in thin else b for a, b in first), *pairs], TORN) | dict.fromkeys(odd, MISFIT)
 
 
-def kept_out(segments: list[Segment], chain: list[int], tried: dict[int, str]) -> dict[int, str]:
-    """Of the frames that it was ``tried`` to go on without, those that stay out.
+def confirmed(segments: list[Segment], chain: list[int], tried: dict[int, str]) -> dict[int, str]:
+    """Those of the suspect frames (``tried`` without) that stay out.
 
-    Behind something that moves by itself frames show two motions as well: such a frame is kept out only where nearly
-    all landmarks of the frame behind then have one motion.
+    An object that moves by itself causes two motions as well. So a frame stays out only if without it nearly all
+    landmarks of the next frame have one motion.
     """
     facts = {one["frame"]: one for meta in resected(segments) for one in meta.get("per_frame", [])[1:]}
     behind = {frame: facts.get(next((f for f in chain if f > frame), frame), {"lost": ""}) for frame in tried}
     # 0.8: of its landmarks.
     one_motion = {f for f, one in behind.items() if "lost" not in one and one["inliers"] >= 0.8 * one["landmarks"]}
-    return {f: why for f, why in tried.items() if why == ODD or f in one_motion}
+    return {f: why for f, why in tried.items() if why == MISFIT or f in one_motion}
 
 
-def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
-    """Which right images are of the time of some left ones: of the first, which tell where they begin to be late, and
-    of others over the sequence, by how much."""
+def synchrony_of_late(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:
+    """Compare late pairs with right images of other times: the first six, which show where the delay begins, and six
+    over the sequence, which show how long it is."""
     shown = list(dict.fromkeys([*late[:6], *spread(late, 6)]))
     return make.synchrony(f"synchrony/lost/{len(late)}", shown, whole)
 
@@ -499,7 +498,7 @@ def lost_by_time(make: Builder, late: list[int], whole: list[int]) -> Handle[Syn
 def matched_pairs(
     make: Builder, rigs: dict[int, Handle[CalibrationFacts]]
 ) -> Generator[Wait, Any, dict[int, BasicPair]]:
-    """Disparities of stereo pairs, each with its rig, and their vertical and reference plane."""
+    """Disparities of stereo pairs, each with its rig, vertical and reference plane."""
     p = make.products
     verticals = {k: vertical(make, k) for k in rigs}
     p.ground = p.level = {k: make.level(k, verticals[k], known) for k, known in rigs.items()}
@@ -515,7 +514,7 @@ def matched_pairs(
 
 
 def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> dict[int, Pair]:
-    """Local elevation models of stereo pairs in the cells of the ``first``; on ground also risk maps and paths."""
+    """Local elevation models of stereo pairs on the lattice of the ``first``; on ground also risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
     for one in matched:
         k, pair = one.frame, make.pair(one.frame, one.level, one.rig, first)
@@ -538,12 +537,13 @@ def vertical(make: Builder, pair: int) -> dict[str, Any]:
     return args
 
 
-def unmoved(
+def refuse_knocked(
     make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]
 ) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
-    """Segments, those refused whose basic pair measures otherwise than the first: its rig was knocked; and such pairs.
+    """Refuse segments after a knock of the rig; return all segments, and the basic pairs after the knock.
 
-    The first pair stands for the calibration, which was made before the drive.
+    The rig was knocked if a basic pair measures other disparities than the first pair, which stands for the
+    calibration made before the drive.
     """
     p, by, cause = make.products, np.zeros(2), ""
     out, moved = [], set[int]()
@@ -559,16 +559,16 @@ def unmoved(
     return out, moved
 
 
-def steps_of(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
+def step_measures(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
     """Return, for each step to the next frame, the displacement as an angle (radians; None: not known) and the share of
     matching pixels."""
     lengths, focal = chosen.meta["displacement"], make.sequence.rig.left.fx
-    turns = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
-    return [[turn, share] for turn, share in zip(turns, chosen.meta["match_rate"], strict=True)]
+    angles = [None if length is None else round(math.atan(length / focal), 4) for length in lengths]
+    return [[angle, share] for angle, share in zip(angles, chosen.meta["match_rate"], strict=True)]
 
 
 def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
-    """What other sensors say of the chosen frames, and how good they are; empty where none is a measurement."""
+    """Measurements of other sensors at the chosen frames, with their accuracy; empty if there are none."""
     s = make.sequence
     if not s.priors:
         return {}
@@ -585,10 +585,10 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
     return {**said, "times": times, "timed": s.times is not None, "georeference": place}
 
 
-def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
-    """Adjust the trajectory to places that are seen again and to other sensors, where there are any."""
+def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Flow:
+    """Adjust the trajectory to loop closures and to other sensors, if there are any."""
     p, known = make.products, sensors(make, frames)
-    p.loops = yield from seen_again(make, pairs)
+    p.loops = yield from loop_closures(make, pairs)
     if not p.resections or not (known or p.loops):
         return
     p.chained = p.trajectory
@@ -606,7 +606,7 @@ def adjusted(make: Builder, frames: Series[int], pairs: list[Pair]) -> Steps:
 def moving_parts(
     make: Builder, segments: list[Segment], pairs: Mapping[int, BasicPair]
 ) -> dict[int, Handle[MovingFacts]]:
-    """What moves by itself in each basic pair, by the next frame; in the last one by the frame before."""
+    """Moving objects in each basic pair, by the motion to the next frame; in the last pair, from the one before."""
     out = dict[int, Handle[MovingFacts]]()
     steps = [(s, s.frames[:2], False) for s in segments] + [(s, s.frames[-2:], True) for s in segments[-1:]]
     for segment, step, back in steps:
@@ -624,8 +624,8 @@ def moving_parts(
     return out
 
 
-def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
-    """Another calibration that all segments ask for, None where they do not; of the rig of pair ``key``."""
+def corrected_calibration(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
+    """Correction of the calibration that all segments agree on, None if they need none; ``key`` gives the rig."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
     asked = {"before": make.correction, "fixed": fixed or None}
@@ -636,20 +636,19 @@ def asked_for(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsF
     return facts if facts and "corrected" in facts and any(facts["correction"]) else None
 
 
-def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
-    """Motions to basic pairs from earlier ones that show the same place; none where no place is seen again."""
+def loop_closures(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[Handle[LoopFacts]]]:
+    """Loop closures: motions to basic pairs from earlier ones that show the same place."""
     if not make.config.loops.enabled or len(pairs) <= make.config.loops.apart:
         return []
     of, blocks = {pair.frame: pair for pair in pairs}, list[Handle[PlacesFacts]]()
-    # Cut by frame numbers: where a pair is left out, the other blocks keep theirs.
-    # 500: frames whose basic pairs are looked for in earlier ones together: blocks that are read by all later blocks.
+    # Blocks of 500 frame numbers, each read by all later ones: if a pair is left out, the other blocks keep theirs.
     for number, group in groupby(of, lambda frame: frame // 500):
         here = list(group)
         features = [make.features(frame, "left") for frame in here]
         blocks.append(make.node(loops_stage, f"loops/{number}", features=features, earlier=list(blocks), pairs=here))
     laid: list[Ref[PlacesFacts]] = yield list(blocks)
     compared = [
-        loop(make, [of[k] for k in (frame, *earlier)])
+        loop_closure(make, [of[k] for k in (frame, *earlier)])
         for block in laid
         for frame, earlier in zip(block.meta["pairs"], block.meta["candidates"], strict=True)
         if earlier
@@ -659,8 +658,8 @@ def seen_again(make: Builder, pairs: Series[Pair]) -> Generator[Wait, Any, list[
     return known if any(ref is not None and ref.meta["factors"] for ref in seen) else []
 
 
-def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
-    """Motions to the first of some pairs from each of the others, which look alike."""
+def loop_closure(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
+    """Motions to the first of some pairs that look alike from each of the others."""
     frames = [pair.frame for pair in pairs]
     return make.node(
         loop_stage,
@@ -672,8 +671,8 @@ def loop(make: Builder, pairs: list[Pair]) -> Handle[LoopFacts]:
     )
 
 
-def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
-    """Structure from motion by another program, in windows; it knows nothing of our trajectory, nor we of its."""
+def crosscheck_tasks(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
+    """Trajectory by another program's structure from motion, in windows; independent of Rille's."""
     features = {(f, camera): make.features(f, camera) for f in whole for camera in CAMERAS}
     parts = [
         make.node(
@@ -691,7 +690,7 @@ def another_program(make: Builder, whole: list[int]) -> Handle[JoinFacts]:
 
 
 def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handle[OverlapFacts]]:
-    """Each model against the earlier ones with which it shares a tile, of many those with most ground in common."""
+    """Compare each model with the earlier ones that share a tile; of many with those of the largest common area."""
     models, seams = make.products.world_dem, dict[int, Handle[OverlapFacts]]()
     present: dict[tuple[int, int], list[tuple[int, list[int]]]] = {}
     for meta in footprints:
@@ -702,7 +701,7 @@ def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handl
                 shared[other] += cells_in_both(box, theirs)
             here.append((pair, box))
         if shared:
-            # 24: enough to tell which is off, however often a place is seen again.
+            # 24: enough to tell which model is off, however often a place is seen again.
             nearest = sorted(shared, key=lambda other: (-shared[other], -other))[:24]
             others = [models[other] for other in sorted(nearest)]
             seams[pair] = make.node(overlap_qa_stage, f"overlap_qa/{pair}", dem=models[pair], others=others)
@@ -710,17 +709,17 @@ def overlaps(make: Builder, footprints: list[TileIndexFacts]) -> dict[int, Handl
 
 
 def cells_in_both(a: Series[int], b: Series[int]) -> int:
-    """Cells that two boxes (first column, first line, columns, lines) have in common."""
+    """Number of common cells of two boxes (first column, first line, columns, lines)."""
     columns, lines = (min(a[k] + a[k + 2], b[k] + b[k + 2]) - max(a[k], b[k]) for k in (0, 1))
     return max(columns, 0) * max(lines, 0)
 
 
 def representative(basic: list[int]) -> list[int]:
-    """Pairs by which one rig is found for all: its time grows with the pairs; of 200 its errors are systematic."""
+    """Pairs that the common rig is estimated from: 200 at most, beyond which its errors are systematic."""
     return spread(basic, 200)
 
 
 def spread(items: list[Any], most: int) -> list[Any]:
-    """Choose at most ``most`` of the items, evenly spaced, beginning with the first."""
+    """At most ``most`` of the items, evenly spaced, beginning with the first."""
     # Minus twice: rounds the stride up, so that no more than `most` remain.
     return items[:: -(-len(items) // most) or 1]

@@ -1,4 +1,4 @@
-"""Large pairs as tasks: which are matched in tiles, in tiles of which size, and the nodes of one pair."""
+"""Tiles of large pairs: which pairs are matched in tiles, how large these are, and the tasks of one pair."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from rille.stages.hfvm.tiles.tile_stage import hfvm_tile_stage
 from rille.stages.imaging.pyramid import PyramidParams, levels_of
 
 WHOLE_BYTES, TILE_BYTES = 170, 300
-"""Room for matching a pixel, bytes: of images that are matched whole, and of a tile, whose surroundings it includes.
+"""Memory for matching, bytes a pixel: of images that are matched whole, and of a tile, its surroundings included.
 
 A pair of 3.3 megapixels matched whole took 151 bytes a pixel, each further pixel 164. Tiles of 1792 pixels of 25
-megapixels took 520 MB besides the program. What grows with the image: removal of isolated
-patches (11 bytes a pixel), putting together (one array at a time, 12 bytes), and in images without texture, where
-displacements are anything, the features of the other one (8 bytes); planes of textureless regions (6 bytes, and 18 more
-where there are large ones).
+megapixels took 520 MB besides the program. These grow with the image: removal of isolated patches (11 bytes a pixel),
+putting together (one array at a time, 12 bytes), the features of the other image where displacements reach all over it,
+as without texture (8 bytes), and planes of textureless regions (6 bytes, 18 more if these are large).
 """
 
-STEP, LEAST = 128, 256
-"""Pixels: sides that are chosen are multiples of the one, and not below the other: surroundings would outweigh it."""
+SIDE_STEP, MIN_SIDE = 128, 256
+"""Pixels: a chosen side is a multiple of the first, and at least the second: below, surroundings outweigh the tile."""
 
 
 class Tiling(Params):
@@ -61,7 +60,7 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
         if max(s[0] * s[1] for s in shapes) * WHOLE_BYTES <= tiling.memory * 1e6:
             return None
         most = int((tiling.memory * 1e6 / TILE_BYTES) ** 0.5)
-        chosen = max(most // STEP * STEP, LEAST)
+        chosen = max(most // SIDE_STEP * SIDE_STEP, MIN_SIDE)
     return chosen if chosen < max(*shapes[0], *shapes[1]) else None
 
 

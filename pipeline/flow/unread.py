@@ -1,4 +1,4 @@
-"""Parameters that were set and that nothing reads: each is an error, said as early as it can be known.
+"""Parameters that were set and that no task reads: each is an error, raised as early as it is known.
 
 A parameter counts as set if it is in force with another value than it would have without ``--set`` and ``--config``:
 the ``config.toml`` of a run, which holds all parameters, can be given back. It is read if a task of the run has its
@@ -6,8 +6,8 @@ section for parameters or arguments. Parameters of a section that the user has s
 (``crosscheck.enabled=false``) are permitted. A section that is off by default reads nothing, and the remedy says how to
 switch it on.
 
-Before anything is computed it is known which sections no task of such a run can read (of a drive those of a
-reconstruction, and the other way round). The rest is known when all tasks are: then the run ends with its results, the
+Sections that no task of such a run can read (of a drive those of a reconstruction, and the other way round) are known
+before anything is computed. The others are known once all tasks are laid out: then the run ends with its results, the
 line that names the parameter, and the exit code of a run with holes.
 """
 

@@ -48,7 +48,7 @@ def _is_wanted(output: Output, view: RunView, graph: Graph) -> bool:
     read = handles(output, view)
     if view.only:
         return output.name in view.only
-    return bool(read) and all(handle.index in graph.asked for handle in read)
+    return bool(read) and all(handle.index in graph.needed for handle in read)
 
 
 def plan(graph: Graph, view: RunView) -> None:
@@ -62,7 +62,7 @@ def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made:
     # Tasks laid out last end last: if one of them is not there, the others need not be looked at.
     read = handles(output, view)[::-1]
     if graph.cut is not None and output.name not in view.only:
-        read = [handle for handle in read if handle.index in graph.asked]
+        read = [handle for handle in read if handle.index in graph.needed]
     yield Maybe(read)
     node = add(graph, module, output, view)
     if node is not None:

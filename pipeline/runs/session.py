@@ -160,7 +160,7 @@ class _Opened:
 def late(view: RunView, drive: Drive | None, **known: Any) -> RunView:
     """The view with facts that are known late: among them the frames that a drive has taken."""
     if drive is not None:
-        known["sequence"], known["frames"] = drive.taken()
+        known["sequence"], known["frames"] = drive.recorded()
     return replace(view, **known)
 
 

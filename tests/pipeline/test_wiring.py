@@ -43,7 +43,7 @@ after a segment to compare its rig with, or a frame that shows what moved."""
 
 def grown(graph: Graph, failing: str = "") -> Graph:
     """All tasks of a dataflow, none of them run; those of a stage that fails have no results, nor what reads them."""
-    waiting, legs = graph.expansions, 0
+    waiting, legs = graph.waiting, 0
     while waiting:
         handles, grow, holes = waiting.pop(0)
         facts: list[SimpleNamespace | None] = []

@@ -24,7 +24,7 @@ from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
 from rille.pipeline.flow import unread
-from rille.pipeline.flow.builders import Builder, name
+from rille.pipeline.flow.builders import Builder, name_graph
 from rille.pipeline.flow.reconstruction import spread, vertical
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
@@ -69,7 +69,7 @@ def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Pat
             # A check of data on a disk that is read only, say.
             kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
             store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
-        name(graph, sequence, frames)
+        name_graph(graph, sequence, frames)
         inspection = Inspection(Builder(graph, sequence, config), frames, store)
         inspection.say(*kept)
         graph.flow(inspection.steps())
@@ -127,7 +127,7 @@ class Inspection:
         """Open every image: sizes, repetitions, exposure, sharpness."""
         looks: dict[str, dict[int, dict[str, Any]]] = {camera: {} for camera in CAMERAS}
         sizes, errors = set(), list[RilleError]()
-        images = {(frame, camera): self.make.taken(frame, camera) for frame in self.frames for camera in CAMERAS}
+        images = {(frame, camera): self.make.raw_image(frame, camera) for frame in self.frames for camera in CAMERAS}
         yield Maybe(list(images.values()))
         for (frame, camera), handle in images.items():
             try:

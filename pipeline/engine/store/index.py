@@ -1,4 +1,4 @@
-"""Index of a store: what the manifests of earlier runs' artifacts state, so that they need not be read again.
+"""Index of a store: what the manifests of earlier runs' artifacts state, so that these need not be read again.
 
 One table of a SQLite file beside the artifacts. A row has the mark of the artifact's file
 (:func:`rille.pipeline.engine.store.folder.mark`), and counts only while the file has the same one. The index is a hint:

@@ -271,7 +271,7 @@ def test_the_vehicle_that_is_configured_is_the_one_that_stands_on_the_bed(store:
     given: dict[str, Any] = {"vehicle": sequence.vehicle.model_dump()}
     flow = Drive(Graph(), sequence, config.build(given, config.expand(sequence.defaults), for_stages))
     flow.build()
-    flow.graph.expansions.clear()
+    flow.graph.waiting.clear()
     driver.run(flow.graph, Store(store), driver.RunOptions(executor="inline")).check()
     assert flow.driven.place is not None
     assert flow.driven.place.ref is not None
