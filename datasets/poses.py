@@ -400,7 +400,7 @@ def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:
         raise InputError("RIL-267", text, remedy="give 12 numbers a line, perhaps behind a time, or state the format")
     columns, warnings = range(timed, table.columns), tuple[str, ...]()
     if timed:  # else rows are frames
-        table, warnings = table.measured(range(table.columns), ~table.values(columns[:12]).any(axis=1))
+        table, warnings = table.measured(range(table.columns), (table.values(columns[:12]) == 0).all(axis=1))
     values = table.numbers(columns, gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
     values[:, :, 3] *= unit
     poses = tuple(
