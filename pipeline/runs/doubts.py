@@ -27,9 +27,10 @@ WHY_NOT = (
 
 
 def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
-    """The images, their 16-bit samples spread where they use a small part of their range, and a warning of it."""
-    used = levels.levels_of(images)
-    return [levels.spread(i, used) for i in images], [] if used is None else [warning("RIL-705", levels.words(used))]
+    """Left and right image, their 16-bit samples spread where they use a small part of their range, and warnings."""
+    used = levels.levels_of_sides(images[:1], images[1:])
+    lines = [warning("RIL-705", line) for line in levels.words(used)]
+    return [levels.spread(i, of) for i, of in zip(images, used, strict=True)], lines
 
 
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:

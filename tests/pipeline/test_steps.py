@@ -214,6 +214,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         rille.hazards(dem, vehicle=3)
     with raises("RIL-027", "vehicle.wings"):
         rille.hazards(dem, vehicle={"wings": 2})
+    with raises("RIL-027", "path.target = 3"):
+        rille.path(rille.hazards(dem), goal=3)  # type: ignore[arg-type]
 
 
 def test_what_a_user_draws_into_an_image_stays_with_them() -> None:
