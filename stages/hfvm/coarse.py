@@ -1,7 +1,7 @@
 """Coarse levels of a pair, step by step: brightness, prior disparities, alignment by a plane or keypoints, focus.
 
-Focus: where one image shows less detail, distances of features and residuals of the refinement measure the blur and not
-the displacement. The finest level then sees the sharper image through a Gaussian that leaves it as much.
+Focus: where one image shows less detail, distances of features and residuals of the refinement measure the blur instead
+of the displacement. At the finest level the sharper image is then blurred by a Gaussian to the same detail.
 """
 
 from __future__ import annotations
@@ -68,19 +68,19 @@ class Coarse:
 
     @cached_property
     def scale(self) -> float:
-        """How many times larger the right image shows things than the left one does; 1 where it is not aligned."""
+        """Size of things in the right image over their size in the left one; 1 where it is not aligned."""
         return 1.0 if self.alignment is None else plane.scale(self.alignment, self.images.left.shapes[0])
 
     @property
     def unlike(self) -> Unlike:
-        """What a user is told of how the right image differs. Blur that follows from the scale is no fault."""
+        """How the right image differs, for the user: without blur that follows from the scale."""
         left, right = (0.0, 0.0) if unlike_scale(self.scale) else self.blur
         return Unlike(self.alignment is not None, left - right)
 
     @property
     def share(self) -> float:
-        """Share of the left image's pixels with texture that are consistent; of those that the right image sees, where
-        it is aligned."""
+        """Share of consistent pixels among the left image's pixels with texture; among those in the right image's view,
+        where it is aligned."""
         left, level = self.images.left, self.state.level
         told = textured(left.layers[level], self.images.params)
         if self.alignment is not None:
@@ -89,7 +89,7 @@ class Coarse:
         return float(np.mean(self.state.left_ok[told])) if told.any() else 0.0
 
     def with_threads(self, threads: int) -> Coarse:
-        """The same, to be matched on by so many threads."""
+        """The same, matched further by so many threads."""
         return replace(self, images=replace(self.images, threads=threads))
 
     def seen(self) -> Coarse:
@@ -98,15 +98,15 @@ class Coarse:
         return replace(self, images=replace(self.images, right=right))
 
     def anew(self, registered: bool = False, **changed: Any) -> Coarse:
-        """Coarse levels of the images with another ``ratio`` or ``alignment``; ``registered``: by which they are known
-        to lie on each other."""
+        """Coarse levels of the images with another ``ratio`` or ``alignment``, which puts them on each other if
+        ``registered``."""
         other = replace(self, **changed).seen()
         above = registration(other.images) if registered else None
         return replace(other, state=descend(other.images, COARSE_LEVEL, above, other.state.near_sign))
 
 
 def registration(images: PyramidPair) -> State:
-    """State above the top in which the right image, which was aligned, lies on the left one."""
+    """State above the top level in which the aligned right image lies on the left one."""
     level, by = images.levels, plane.margin(images.left.shapes[0]) >> images.levels
     a, b = (tuple((n + 1) // 2 for n in image.shapes[level - 1]) for image in (images.left, images.right))
     left, right = Map(*np.full((2, *a), by, np.int16)), Map(*np.full((2, *b), -by, np.int16))
@@ -114,9 +114,9 @@ def registration(images: PyramidPair) -> State:
 
 
 def even(coarse: Coarse) -> Coarse:
-    """Brightness ratio of both images undone in the right one, first by a guess where little matches."""
+    """Correct the right image's brightness to the left one's, first by a guess where little matches."""
     left = coarse.images.left
-    # 0.85: share of consistent pixels from which on no other brightness is guessed.
+    # 0.85: share of consistent pixels from which on brightness is not guessed.
     if coarse.share < 0.85:
         guessed = guess(left, coarse.given, min(COARSE_LEVEL + 2, coarse.images.levels - 1))
         if greatest(guessed) > MIN_LOG_RATIO:
@@ -128,7 +128,7 @@ def even(coarse: Coarse) -> Coarse:
         if ratio is None or greatest(ratio - before) <= MIN_LOG_RATIO:
             break
         tried = coarse.anew(ratio=ratio)
-        # Of the consistent pixels a few change anyway.
+        # 0.95: a few consistent pixels change in any case.
         if tried.share < 0.95 * coarse.share:
             break
         coarse = tried
@@ -136,36 +136,35 @@ def even(coarse: Coarse) -> Coarse:
 
 
 def known(coarse: Coarse) -> Coarse:
-    """Disparities known beforehand in the place of those found."""
+    """Replace displacements by the prior ones where these are known."""
     prior, h = coarse.prior, coarse.alignment
     if prior is not None and h is not None:
-        # Points near the horizon of the plane get displacements greater than the prior's.
+        # Near the horizon of the plane carried displacements exceed all bounds.
         prior = bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
     return replace(coarse, state=impose(coarse.images, coarse.state, prior))
 
 
 def align(coarse: Coarse) -> Coarse:
-    """The right image aligned by the dominant plane, where one explains the matches."""
-    # 0.8: share of consistent pixels below which a plane need explain fewer of them.
+    """Align the right image by the dominant plane, where one explains the matches."""
+    # 0.8: share of consistent pixels below which a plane of fewer matches counts.
     few = coarse.share < 0.8
     h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
     return coarse if h is None else known(coarse.anew(alignment=h))
 
 
 def turn(coarse: Coarse) -> Coarse:
-    """The right image turned and scaled by keypoints, where hardly a pixel matches and that helps."""
-    # A plane may also be fitted to the few matches that chance makes.
+    """Align the right image by keypoints, where hardly a pixel matches and more do so afterwards."""
     left, given = coarse.images.left, coarse.given
     unlike = coarse.alignment is None and other_size(left.shapes[0], given.shapes[0])
-    # 0.6: share of consistent pixels below which the images may be turned, or far apart: chance alone makes up to .23
-    # of them so, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more.
+    # 0.6: share of consistent pixels up to which the images may be turned, or far apart: by chance up to .23 are
+    # consistent, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more.
     few = unlike or coarse.share <= 0.6
     h = plane.find_turn(left, given) if few and coarse.prior is None else None
     if h is None:
         return coarse
     # Brightness can be compared only once the images are upright.
     upright = replace(coarse, state=replace(coarse.state, near_sign=0.0), ratio=None)
-    # The right image may show a part of the left one, or the other way round: coarse levels would find chance there.
+    # Registered: one image may show a part of the other, where a search of the top level would match by chance.
     turned = upright.anew(registered=True, alignment=h)
     # Keypoints lie on objects that stand out; the matches after the turn show the plane better.
     h = plane.refitted(sample(turned.images, turned.state), turned.state.level, left.shapes, h)
@@ -181,7 +180,7 @@ def matched_places(coarse: Coarse) -> tuple[Places, Places]:
     """Pixels of consistent matches with texture, in the left image and in the right one as it came, at the level."""
     state, h = coarse.state, coarse.alignment
     layer, shape = coarse.images.left.layers[state.level], coarse.right.layers[state.level].shape
-    # 4000: places that tell the energies of texture to a few per cent.
+    # 4000: places that determine the energies of texture to a few per cent.
     y, x = thinned(state.left_ok & textured(layer, coarse.images.params), 4000)
     own = np.eye(3) if h is None else plane.to_original(h, coarse.images.left.shapes[0])
     to_level_0 = plane.finer(state.level)
@@ -197,10 +196,10 @@ def unlike_scale(scale: float) -> bool:
 
 
 def focus(coarse: Coarse) -> Coarse:
-    """The same with the ``blur`` that leaves the sharper image the detail of the other one; none where both are alike.
+    """Determine the ``blur`` that reduces the sharper image to the detail of the other one; none if both are alike.
 
-    Detail is the energy of fine texture over that of coarser one, at the matches; not in an aligned image, which
-    interpolation has blurred. Between images of other scale it follows from the scale.
+    Detail is the energy of fine texture over that of coarser texture, at the matches, in the original images, since
+    interpolation blurs the aligned one. Between images of unlike scale the blur follows from the scale.
     """
     level, left, larger = coarse.state.level, coarse.images.left, coarse.scale
     if unlike_scale(larger):
@@ -218,8 +217,8 @@ def focus(coarse: Coarse) -> Coarse:
         return float(np.sum(np.square(fine[alike]))) / max(float(np.sum(np.square(coarser[alike]))), 1e-9)
 
     a, b = (bands(0.0, side, (0.7, 1.4, 2.8, 4.0)) for side in (0, 1))
-    # Wrong matches show other detail, as a rule less than the place that they were sought for; right ones show the same
-    # coarse texture, which a blur leaves.
+    # Wrong matches have other detail, mostly less than the left pixel has. Right ones have the same coarse texture,
+    # which blur does not change.
     alike = np.abs(a[2] - b[2]) < 0.3 * np.minimum(np.abs(a[2]), np.abs(b[2]))
     # 1000: places of which chance leaves the ratio of detail above 0.85; of 600 it does not.
     if np.count_nonzero(alike) < 1000:
@@ -230,8 +229,8 @@ def focus(coarse: Coarse) -> Coarse:
     def more(blur: float) -> float:
         return detail(*bands(blur, side, (0.7, 1.4, 2.8))) - less
 
-    # 0.85: cameras of one kind have 0.93 and more, images blurred by 0.8 pixels have as much. Beyond 4 pixels there is
-    # little left to match.
+    # 0.85: cameras of one kind have 0.93 and more, as have images blurred by 0.8 pixels. Beyond 4 pixels hardly any
+    # pixel matches.
     if less >= 0.85 * max(found) or more(4.0) >= 0:
         return coarse
     blur = brentq(more, 0.0, 4.0, xtol=0.01)
