@@ -169,12 +169,12 @@ def _usual(values: Sequence[float | None]) -> float:
 
 
 def _neighbours(frames: Sequence[int], of: Set[int]) -> set[int]:
-    """Frames beside some others."""
+    """Frames next to some others."""
     return {n for a, b in pairwise(frames) for f, n in ((a, b), (b, a)) if f in of}
 
 
 def _doubtful_runs(good: Sequence[bool]) -> list[tuple[int, int]]:
-    """Places (i, j) of the frames before and behind each run of at least two doubtful steps between good ones."""
+    """Places (i, j) of the frames before and after each run of at least two doubtful steps between good ones."""
     runs = [(fine, list(group)) for fine, group in groupby(range(len(good)), good.__getitem__)]
     return [(steps[0], steps[-1] + 1) for fine, steps in runs if not fine and len(steps) >= 2]
 

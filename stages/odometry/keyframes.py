@@ -1,7 +1,7 @@
 """Choice of the basic pairs: which stereo pairs become elevation models (paper, sections 7.2 and 7.4).
 
 Successive basic pairs bound a *segment*: the left images from one to the next are tracked and resected against the
-elevation model of the first. Positions behind the last basic pair are an open last segment.
+elevation model of the first. Positions after the last basic pair are an open last segment.
 
 The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
 still shows the wanted share of what the one before shows (:mod:`rille.stages.odometry.steps`): poses are not
@@ -122,7 +122,7 @@ def _fit(positions: Iterable[int], unfit: set[int]) -> int | None:
 
 
 def _overlap(steps: Sequence[Step]) -> float | None:
-    """Overlap of the frames before and behind some steps; None: one of them shows too little."""
+    """Overlap of the frames before and after some steps; None: one of the steps has too few matches."""
     *_, last = overlaps(steps)
     return min(last) if all(step.overlaps for step in steps) else None
 
@@ -136,7 +136,7 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 def _warnings(
     steps: Sequence[Step], basic: Sequence[int], overlap: Sequence[float | None], params: KeyframesParams
 ) -> list[str]:
-    """What the choice of ``basic`` pairs could not give; ``overlap`` of each with the one before."""
+    """Shortcomings of the choice of ``basic`` pairs; ``overlap`` of each with the one before."""
     lines = []
     blind = [k for k, step in enumerate(steps) if not step.overlaps]
     if blind:

@@ -1,4 +1,4 @@
-"""Whether frames stand in another order than they were taken: a camera that jumps, where another order has no jump."""
+"""Order of frames without jumps, where the camera jumps in the given one."""
 
 from __future__ import annotations
 
