@@ -135,7 +135,7 @@ class PathMaps:
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
 
     def ways(self, below: str) -> Bytes:
-        """Directions (row, col), as bits, in which the vehicle may stand with ``below`` (:data:`GROUNDS`) on known ground."""
+        """Directions (row, col), as bits, in which it may stand with ``below`` (:data:`GROUNDS`) on known ground."""
         if below not in self._ways:
             self._ways[below] = self._places.ways(below)
         return self._ways[below]
