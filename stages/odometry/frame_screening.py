@@ -122,7 +122,7 @@ def judge(
             continue
         for a, f, b in zip(chain[i:j], chain[i + 1 : j], chain[i + 2 :], strict=False):
             if steps[bridge] >= MIN_MATCHES or f in out.unfit:
-                shares = f"{steps[a, f]:.0%} of its pixels match the frame before, {steps[f, b]:.0%} the one behind"
+                shares = f"{steps[a, f]:.0%} of its pixels match the frame before, {steps[f, b]:.0%} the one after"
                 out.lost[f] = (
                     f"{out.unfit[f]}, {shares}" if f in out.unfit else f"not found in its neighbours: {shares}"
                 )

@@ -142,7 +142,7 @@ def _warnings(
     if blind:
         lines.append(
             f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
-            f" {min(steps[k].match_rate for k in blind):.0%}), first behind the frame at position {blind[0]}: the"
+            f" {min(steps[k].match_rate for k in blind):.0%}), first after the frame at position {blind[0]}: the"
             " overlap there is not known, and the frames are tracked on a poor prediction"
         )
     least, at = min(((v, k) for k, v in enumerate(overlap) if v is not None), default=(1.0, 0))

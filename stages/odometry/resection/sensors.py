@@ -303,7 +303,7 @@ class PositionPrior:
             if why and standing_out(steps).any():
                 at = int(steps.argmax())
                 x, y = fixes.positions[mine][at, :2]
-                why += f"; they jump by {steps[at]:.2g} m behind ({x:.2f}, {y:.2f})"
+                why += f"; they jump by {steps[at]:.2g} m after ({x:.2f}, {y:.2f})"
             found.append((off, why))
         return max(found, key=lambda one: (bool(one[1]), one[0]), default=(math.inf, ""))
 
