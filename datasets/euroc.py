@@ -29,8 +29,15 @@ from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 
-TRUTH: Mapping[str, bool] = {"state_groundtruth_estimate0": True, "gt": True, "mocap0": True, "vicon0": False}
-"""Folders of true poses, the best first, and whether they are those of the body where no ``T_BS`` is stated."""
+TRUTH: Mapping[str, bool] = {
+    "state_groundtruth_estimate0": True,
+    "gt": True,
+    "mocap0": True,
+    "vicon0": False,
+    "leica0": False,
+}
+"""Folders of true poses (the last: positions), the best first, and whether they are the body's where no ``T_BS`` is
+stated."""
 
 IMU = "imu0"
 """Folder of the IMU."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.poses import coverage, refuse_apart, times_of
+from rille.datasets.poses import coverage, meanings, refuse_apart, times_of
 from rille.datasets.protocol import Rows, rows_of
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES
@@ -38,12 +38,12 @@ HALF_WINDOW = 1.0
 """s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
 flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; half the window triples that."""
 
-GYROSCOPE = re.compile(r"(.*[./])?(gyr|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
+GYROSCOPE = re.compile(r"(.*[./])?(gyr|g_?[xyz]\b|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
 """How names of columns begin, behind the path of a field of a message of ROS."""
 
 ORDER = ([1, 2, 3], [4, 5, 6])
-"""Columns of rates and forces where no names tell."""
+"""Columns of rates and forces where no names tell; times are before them."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,9 @@ def read_imu(path: Path) -> ImuRecord:
         text = f"{path}, line {table.lines[0]}: {table.columns} columns are no IMU record"
         raise InputError("RIL-186", text, remedy="give time, three rates (rad/s) and three accelerations (m/s^2) a row")
     gyro, accelerometer = _columns(table)
-    table, warnings = table.measured([0, *gyro, *accelerometer])
-    times = times_of(table, 0)
+    time = meanings(table).get("time", 0)
+    table, warnings = table.measured([time, *gyro, *accelerometer])
+    times = times_of(table, time)
     rates, forces = table.measures(gyro, RATES), table.measures(accelerometer, FORCES)
     # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
     _possible(rates, 200.0, "rad/s", table)
@@ -147,10 +148,13 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
         text = f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged"
         remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
         raise InputError("RIL-187", text, remedy=remedy)
-    # Multiples of gravity, or without it; even the Moon's is more.
-    if force < 1.2:
-        text = f"{name}: accelerations of {force:.3g} are too small to hold gravity in m/s^2"
-        raise InputError("RIL-188", text, remedy="give them in m/s^2, gravity not taken off: 9.81 at rest")
+    # Multiples of gravity, or without it; even the Moon's is more, and no vehicle is pressed by five times the Earth's.
+    if not 1.2 <= force <= 50.0:
+        text = (
+            f"{name}: accelerations of {force:.3g} are too {'small' if force < 1.2 else 'large'} to be gravity in m/s^2"
+        )
+        remedy = "give them in m/s^2, gravity not taken off (9.81 at rest), or name their unit, as acc_x [mg]"
+        raise InputError("RIL-188", text, remedy=remedy)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

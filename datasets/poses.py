@@ -2,7 +2,7 @@
 
 Forms of a file, one pose T_reference_body a row:
 
-* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, without times;
+* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, perhaps behind a time;
 * ``tum``: time, x y z, quaternion x y z w;
 * ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
@@ -51,6 +51,9 @@ IMAGES = ("image", *QUATERNION, *POSITION, "camera", "name")
 IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 """Line of an image in a model of COLMAP, where the name is that of an image."""
 
+STAMP = re.compile(r"\d{16,}")
+"""Time of EuRoC, nanoseconds; programs that write seconds have other orders."""
+
 MIN_ROUNDED = 4
 """Rows from which on coordinates tell their precision."""
 
@@ -70,9 +73,10 @@ WORDS = (
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"theta"), lambda m: "yaw"),
-    (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)"), lambda m: "x"),
-    (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)"), lambda m: "y"),
-    (re.compile(r"up|height|alt|altitude|elevation|down|depth"), lambda m: "z"),
+    # A baseline is that of RTKLIB, from the reference station.
+    (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
+    (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
+    (re.compile(r"up|u-baseline|height|alt|altitude|elevation|down|depth"), lambda m: "z"),
 )
 
 DOWNWARDS = re.compile(r"down|depth")
@@ -82,7 +86,8 @@ DOWNWARDS = re.compile(r"down|depth")
 # Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one.
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
-DEGREES = re.compile(r"\b(lat|lon)")
+NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
+"""In names of columns of degrees, and of coordinates from the Earth's centre."""
 
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
 """Name of a column behind that of the whole seconds, as ROS stamps messages."""
@@ -129,12 +134,14 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
         The form is not recognised, or a row is not a time and a pose; the message names the line.
     """
     if table.header == IMAGES:
-        poses = _posed(table, _meanings(table), unit)
+        poses = _posed(table, meanings(table), unit)
         images = tuple(table.text(len(IMAGES) - 1))
         return TimedPoses(None, tuple(pose.inverse() for pose in poses), table.name, images=images)
-    meant = _meanings(table)
-    if format == "kitti" or (format == "auto" and table.columns in (12, 16) and not _whole(meant)):
-        return TimedPoses(None, _matrices(table, 1.0 if unit is None else unit), table.name)
+    meant = meanings(table)
+    first = matrix_at(table)
+    shaped = first is not None or table.columns in (12, 16)
+    if format == "kitti" or (format == "auto" and shaped and not _whole(meant)):
+        return _of_matrices(table, 1.0 if unit is None else unit, timed=first == 1)
     columns = _columns(table, format, meant)
     warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
@@ -219,16 +226,17 @@ def positions_of(
         return None
     stated = {meaning: _column(table, column) for meaning, column in columns.items()}
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
-    meant = {meaning: k for meaning, k in _meanings(table).items() if k not in stated.values()} | stated
+    meant = {meaning: k for meaning, k in meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
-    if not columns and (_whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"]))):
+    posed = _whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"])) or matrix_at(table) is not None
+    if not columns and posed:
         return None
-    if len(known) < 2 or any(DEGREES.search(table.header[meant[axis]]) for axis in known if table.header):
+    if len(known) < 2 or any(NOT_IN_PLANE.search(table.header[meant[axis]]) for axis in known if table.header):
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
-        if any(map(DEGREES.search, table.header)):
-            remedy = "project latitude and longitude to metres, as UTM has them, in columns x and y"
+        if any(map(NOT_IN_PLANE.search, table.header)):
+            remedy = "project them to metres in a plane, as UTM has them (easting, northing), in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     placed = [meant["x"], meant["y"]]
     placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
@@ -276,7 +284,7 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
 
 def names_positions(table: TextTable) -> bool:
     """Whether columns are named as x and y, or east and north."""
-    return {"x", "y"} <= _meanings(table).keys()
+    return {"x", "y"} <= meanings(table).keys()
 
 
 def _column(table: TextTable, stated: str | int) -> int:
@@ -290,7 +298,7 @@ def _column(table: TextTable, stated: str | int) -> int:
     raise InputError("RIL-806", text, remedy="give a name of its first line, or a number from 1")
 
 
-def _meanings(table: TextTable) -> dict[str, int]:
+def meanings(table: TextTable) -> dict[str, int]:
     """Columns by what their names mean."""
     columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
@@ -318,6 +326,12 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
+    bare = table.commas and table.columns == len(ORDERED["tum"]) and not STAMP.fullmatch(table.rows[0][0])
+    if format == "auto" and bare:
+        text = f"{table.name}: nothing says whether its quaternions are x, y, z, w or w, x, y, z"
+        raise InputError(
+            "RIL-745", text, remedy='name its columns, or state format = "tum" (w last) or "euroc" (w first)'
+        )
     order = ORDERED.get(form, ())
     more = table.columns > len(order) and (form == "tum" or (format == "auto" and table.header))  # of other meaning
     if not order or table.columns < len(order) or more:
@@ -369,17 +383,31 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
 
 
-def _matrices(table: TextTable, unit: float) -> tuple[RigidTransform | None, ...]:
-    """Poses of rows of [R | t], of which t is in units of ``unit`` m."""
-    if table.columns not in (12, 16):
+def matrix_at(table: TextTable) -> int | None:
+    """Column from which on rows are [R | t], 0 or, behind a time, 1; None where the first whole one is no rotation."""
+    first = int(table.columns in (13, 17))
+    if table.columns - first not in (12, 16):
+        return None
+    values = table.values(range(first, table.columns))
+    whole = values[np.isfinite(values).all(1) & values.any(1)][:1].reshape(-1, 4)[:3, :3]
+    return first if len(whole) and np.allclose(whole @ whole.T, np.eye(3), atol=0.05) else None
+
+
+def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:
+    """Poses of rows of [R | t], of which t is in units of ``unit`` m, behind a time or without."""
+    if table.columns - timed not in (12, 16):
         text = f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose"
-        raise InputError("RIL-267", text, remedy="give 12 numbers a line, or state the format")
-    values = table.numbers(range(table.columns), gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
+        raise InputError("RIL-267", text, remedy="give 12 numbers a line, perhaps behind a time, or state the format")
+    columns, warnings = range(timed, table.columns), tuple[str, ...]()
+    if timed:  # else rows are frames
+        table, warnings = table.measured(range(table.columns), (table.values(columns[:12]) == 0).all(axis=1))
+    values = table.numbers(columns, gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
     values[:, :, 3] *= unit
-    return tuple(
+    poses = tuple(
         None if np.isnan(m).any() or not m.any() else rounded_pose(m, f"{table.name}, line {line}")
         for m, line in zip(values, table.lines, strict=True)
     )
+    return TimedPoses(times_of(table, 0) if timed else None, poses, table.name, warnings)
 
 
 def rounded_pose(m: Floats, where: str) -> RigidTransform:

@@ -188,8 +188,8 @@ def _reopened(path: str, *assigned: str) -> StereoSequence:
 def place_of(path: object) -> str:
     """Name or path of a sequence, as a command line has it; what can be none is refused."""
     if not isinstance(path, str | Path):
-        text = f"a {type(path).__name__} is no sequence"
-        raise InputError("RIL-970", text, remedy="give a name, a path, or what rille.open returns")
+        text = f"a {type(path).__name__} is no name or path of a sequence"
+        raise InputError("RIL-970", text, remedy="give one; rille.reconstruct also takes what rille.open returns")
     return expanduser(path)
 
 
@@ -252,8 +252,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Warns
     -----
     UserWarning
-        Hardly a pixel matches, most have no texture, left and right seem swapped, one image is blurred beside the other
-        one, or samples of 16 bits use a small part of their range and are spread.
+        Hardly a pixel matches, most have no texture, one image is blurred beside the other one, or samples of 16 bits
+        use a small part of their range and are spread.
 
     Examples
     --------
@@ -546,7 +546,7 @@ def path(
     from rille.stages.hazard import risk as risk_stage
     from rille.stages.planning import path as path_stage
 
-    ends = {name: list(end) for name, end in (("target", goal), ("start", start)) if end is not None}
+    ends = {name: end for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
     given = _bundle(hazards, risk_stage.risk_stage, "risk", "rille.hazards")

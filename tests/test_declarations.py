@@ -13,7 +13,7 @@ from rille.stages.core.declare import declared
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad", "m/px"}
 DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
 DRIVE_STAGES = ("mockup.rover", "mockup.sense", "mockup.obstacle", "mockup.overview")
-TILE_STAGES = ("tile_stage", "join_stage")
+TILE_STAGES = ("tiles.tile_stage", "tiles.join_stage")
 DECLARED = (
     stages()
     | {name: declared(importlib.import_module(f"rille.stages.hfvm.{name}")) for name in TILE_STAGES}

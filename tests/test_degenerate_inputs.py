@@ -40,7 +40,6 @@ RUNS = {
 }
 ELSEWHERE = {
     *(
-        "calibration.mirror_check",
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",

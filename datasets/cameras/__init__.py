@@ -20,22 +20,9 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 KNOWN = (
     "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal and VINS, BoofCV, "
     "ZED .conf, DepthAI, COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, "
-    "CAHVORE) are read"
+    "CAHVORE) are read; of another program write K1, D1, K2, D2, R and T (metres; MATLAB's K and R transposed) as "
+    "OpenCV's YAML"
 )
-
-FOREIGN = (
-    (
-        re.compile("CameraParameters1|TranslationOfCamera2|PoseCamera2"),
-        "MATLAB's stereoParameters",
-        "write K1, D1, K2, D2, R, T as OpenCV's YAML (IntrinsicMatrix and RotationOfCamera2 transposed, T in metres)",
-    ),
-    (
-        re.compile(r"<chunk|<calibration>\s*<projection>"),
-        "Metashape's",
-        "save each camera as OpenCV's XML (Tools, Camera Calibration, Save), and state rig.baseline or T_right_left",
-    ),
-)
-"""Files that are known and not read: a pattern, whose they are, and how to write what is read."""
 
 Text: TypeAlias = Callable[[str], bool]
 Entries: TypeAlias = Callable[[Fields], bool]
@@ -112,7 +99,4 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
             found = read_fields(fields, path)
             fields.check_lens()
             return found
-    for known, whose, remedy in FOREIGN:
-        if known.search(text):
-            raise InputError("RIL-101", f"{path} is {whose}, which is not read", remedy=remedy)
     raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)

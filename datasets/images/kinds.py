@@ -23,7 +23,7 @@ KINDS: dict[str, tuple[str, str]] = {
     "array": (
         ".npy",
         "python -c \"import sys, cv2, numpy as n; [cv2.imwrite(f[:-3] + 'png', n.load(f)) for f in sys.argv[1:]]\""
-        " FILES",
+        " FILES; of a table write text: numpy.savetxt",
     ),
     "matrix file": (
         ".npz .mat .pkl .pickle",

@@ -68,15 +68,16 @@ def examined(sequence: Sequence) -> Sequence:
                 "a dark frame, the mean of images that are taken with the lens covered"
             )
             lines.append(warning("RIL-833", text))
-    chosen_levels = levels.levels_of(image for of in images.values() for image in of)
-    if chosen_levels is None:
+    chosen_levels = levels.levels_of_sides(*images.values())
+    if not any(chosen_levels):
         return replace(sequence, warnings=(*sequence.warnings, *lines))
-    lines.append(warning("RIL-827", levels.words(chosen_levels)))
+    lines += [warning("RIL-827", line) for line in levels.words(chosen_levels)]
+    of_camera = dict(zip(images, chosen_levels, strict=True))
 
     def image(frame: int, camera: str) -> Source:
-        source = sequence.image(frame, camera)
-        deep = source.args["header"]["depth"] == 16
-        return replace(source, args={**source.args, "levels": chosen_levels}) if deep else source
+        source, used = sequence.image(frame, camera), of_camera[camera]
+        deep = used is not None and source.args["header"]["depth"] == 16
+        return replace(source, args={**source.args, "levels": used}) if deep else source
 
     return replace(sequence, image=image, warnings=(*sequence.warnings, *lines))
 

@@ -259,7 +259,8 @@ class Poses(Recorded):
     Attributes
     ----------
     file : poses, one a pair, or with times.
-    format : kitti 3 x 4, tum, euroc, csv, or colmap (images.txt, by the names of the left images).
+    format : kitti 3 x 4 (perhaps behind a time), tum, euroc, csv, or colmap (images.txt, by the names of the left
+        images).
     T_body_left : rows of [R | t], m: from the left camera's frame to the body's whose poses the file has.
     max_gap : s; poses are interpolated over no longer gap.
     """

@@ -260,15 +260,16 @@ class MotionReader:
 
     def true_positions(self, section: Truth, found: TimedPositions) -> protocol.Positions:
         """Positions of the truth, which have no rotations."""
-        if section.T_body_left is not None:
-            text = f"truth.T_body_left: {section.file} holds positions, which have no rotations to move by"
-            raise InputError("RIL-802", text, remedy="remove T_body_left, or give poses")
         if (section.sigma_m or section.sigma_deg) is not None:
             text = f"truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
         self.refuse_sparse(section, times or (), "truth")
-        return protocol.Positions(rows, times, section.max_gap, section.lever_arm)
+        mount, lever = section.T_body_left, section.lever_arm
+        if mount is not None and lever is None:  # the body's origin is the antenna
+            x, y, z = map(float, RigidTransform.from_matrix(mount).inverse().translation)
+            lever = x, y, z
+        return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
         """Refuse rows of which most are more than ``max_gap``, s, apart, so that there is nothing between them."""

@@ -77,7 +77,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     lines += check_baseline(rig.baseline, manifest.rig)
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = "the images are rectified by their name: their camera is P, without the distortion"
-        lines.append(warning("RIL-817", f"{text} (images.rectified = false if they are raw)"))
+        lines.append(warning("RIL-817", f"{text} (state images.rectified = false in a manifest if they are raw)"))
     return Optics(rig, lenses, up, (*lines, *unusual_cameras((left, right), sizes)))
 
 
@@ -219,7 +219,7 @@ def check_baseline(baseline: float, section: RigSection) -> list[str]:
     if baseline > USUAL_BASELINE and from_files and "unit" not in section.model_fields_set:
         line = (
             f"the baseline is {baseline:g} m: is the calibration's unit the metre, not a centimetre or a "
-            "square of the chessboard? rig.unit states its length in metres, 1 keeps it"
+            "square of the chessboard? A manifest's rig.unit states its length in metres, 1 keeps it"
         )
         return [warning("RIL-716", line)]
     return []

@@ -90,9 +90,6 @@ class MockupParams(SetupParams):
         0.0, ge=-45.0, le=45.0, description="turn to the left per frame [degrees]; 360 over the frames: a closed way"
     )
     roll_deg: float = Field(0.0, ge=-30.0, le=30.0, description="constant roll to the right [degrees]")
-    roll_swing_deg: float = Field(
-        0.0, ge=0.0, le=60.0, description="roll from frame to frame [degrees], right and left in turn"
-    )
     jitter_deg: float = Field(0.0, ge=0.0, le=10.0, description="standard deviation of each frame's angles [degrees]")
     inclinometer: bool = Field(
         True, description="whether the vertical is measured; false: the ground is levelled by its own plane"

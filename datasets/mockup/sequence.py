@@ -99,14 +99,13 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     middle = 0.5 * (p.bed_length - offsets[:, 1].min() - offsets[:, 1].max())
     offsets[:, 1] += middle if p.turn_deg else FIRST_Y_M - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * np.random.default_rng([p.seed, 60]).standard_normal((p.frames, 3))
-    swings = np.deg2rad(p.roll_swing_deg) * (np.arange(p.frames) % 2 - 0.5)
     T_bed_plane = RigidTransform(rotation_exp([np.deg2rad(p.slope_deg), 0.0, 0.0]), np.zeros(3))
     poses = []
-    for (x, y), turn, (pitch, roll, heading), swing in zip(offsets, turns, shakes, swings, strict=True):
+    for (x, y), turn, (pitch, roll, heading) in zip(offsets, turns, shakes, strict=True):
         rotation = (
             rotation_exp([0.0, 0.0, turn + heading])
             @ rotation_exp([pitch, 0.0, 0.0])
-            @ rotation_exp([0.0, math.radians(p.roll_deg) + roll + swing, 0.0])
+            @ rotation_exp([0.0, math.radians(p.roll_deg) + roll, 0.0])
         )
         poses.append(T_bed_plane @ RigidTransform(rotation, np.array([x, y, p.camera_height])))
     return poses

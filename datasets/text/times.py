@@ -88,7 +88,7 @@ def seconds(
     if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
         text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
         likely = "ns" if usual > 1.0 else "s"
-        remedy = f'state their unit: times.unit = "{likely}" in the manifest, or name the column time_{likely}'
+        remedy = f'name the column time_{likely}; those of the pairs have times.unit = "{likely}" in the manifest'
         raise InputError("RIL-687", text, remedy=remedy)
     return times
 

@@ -7,23 +7,37 @@ from collections.abc import Mapping
 
 import numpy as np
 
-LENGTHS: Mapping[str, float] = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048}
-ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}
-RATES: Mapping[str, float] = {"rad s": 1.0, "deg s": ANGLES["deg"], "dps": ANGLES["deg"], **ANGLES}
-FORCES: Mapping[str, float] = {"m s": 1.0, "m s s": 1.0, "g": 9.80665}
+METRIC: Mapping[str, float] = {"m": 1.0, "um": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3}
+LENGTHS: Mapping[str, float] = {**METRIC, "in": 0.0254, "ft": 0.3048, "usft": 1200 / 3937, "yd": 0.9144}
+ANGLES: Mapping[str, float] = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "gon": np.pi / 200}
+RATES: Mapping[str, float] = {
+    **ANGLES,
+    **{f"{unit} s": factor for unit, factor in ANGLES.items()},
+    "dps": ANGLES["deg"],
+    "mdps": 1e-3 * ANGLES["deg"],
+}
+FORCES: Mapping[str, float] = {"m s": 1.0, "m s s": 1.0, "g": 9.80665, "mg": 9.80665e-3}
 """Units of a column, as :func:`unit_of` gives them, in metres, radians and seconds."""
 
-UNITS = frozenset(
-    ("", *LENGTHS, "rad", "deg", "dps", "g", "s", "ms", "us", "ns", "sec", "mg", "mdps", "mrad", "px", "%")
-)
+UNITS = frozenset(("", *LENGTHS, *ANGLES, "dps", "mdps", "g", "mg", "s", "ms", "us", "ns", "sec", "px", "%"))
 OPERATOR = re.compile(r"[-_/^*.\d \[\]()]+")
 """Words of a row of units, and what stands between and about them: ``[m s^-2]``."""
 
-SPELT = (("deg", "deg(rees?|s)|\N{DEGREE SIGN}"), ("rad", "rad(ians?|s)"), ("m", "met(er|re)s?"), ("ft", "feet|foot"))
+SPELT = (
+    ("deg", "deg(rees?|s)|\N{DEGREE SIGN}"),
+    ("gon", "grads?|grades?"),
+    ("rad", "rad(ians?|s)"),
+    ("m", "met(er|re)s?"),
+    ("usft", "us[- ]?(survey[- ]?)?(f(ee|oo)?t)|ft[-_ ]?us"),
+    ("ft", "feet|foot"),
+    ("in", "inch(es)?"),
+    ("yd", "yards?"),
+)
 """Symbols of units, and how else they are written."""
 
 STATED = re.compile(
-    r"[\[(](.*?)[\])]|[_ ]((?:[mun]?s|[mck]?m|ft)(?:[_/]s2?)?$|(?:m?rad|deg|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
+    r"[\[(](.*?)[\])]"
+    r"|[_ ]((?:[mun]?s|[muckd]?m|ft|in|inch|yd)(?:[_/]s2?)?$|(?:m?rad|deg|gon|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
 )
 """Unit in the name of a column: in brackets, or at its end; of turns also before the axis."""
 

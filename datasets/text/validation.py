@@ -14,7 +14,7 @@ from rille.stages.core.errors import ConfigError, InputError, RilleError, did_yo
 Model = TypeVar("Model", bound=Params)
 
 TAG = "("
-MEMBER = re.compile(r"[(\[]|(constrained-)?(float|int|str)$|tuple\[")
+MEMBER = re.compile(r"[(\[]|literal\[|(constrained-)?(float|int|str)$|tuple\[")
 """Begins the name of a member of a union, or of one without a name, which pydantic gives as if it were a key."""
 
 
@@ -57,7 +57,7 @@ def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
     first, *parts = map(str, error["loc"] or [""])
     key = section + ".".join([first, *(part for part in parts if not MEMBER.match(part))])
     if error["type"] == "extra_forbidden":
-        return f"unknown key {key!r} (value {error['input']!r:.200}): {_nearest(key, known)}"
+        return f"unknown key {key!r} (value {error['input']!r:.200}): {_nearest(key, error['input'], known)}"
     if error["type"] == "missing":
         return f"{key} is missing"
     reason = str(error.get("ctx", {}).get("error", error["msg"])).replace("valid tuple", "list")
@@ -65,11 +65,15 @@ def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
     return f"{key}{value}: {reason[0].lower() + reason[1:]}" if key else reason
 
 
-def _nearest(key: str, known: list[str]) -> str:
+def _nearest(key: str, value: object, known: list[str]) -> str:
     """The key that may have been meant: of the same name in another table, or of the same table."""
     table, dot, last = key.rpartition(".")
+    if isinstance(value, Mapping) and value and last == table:
+        return f"did you mean {table}.{next(iter(value))}?"
     beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == table]
-    elsewhere = [k for k in known if k.rpartition(".")[2] == last]
+    # A table alone means another one: stages and keys may share their names, as track of a stage and of a vehicle.
+    others = () if isinstance(value, Mapping) else {k.rpartition(".")[0] for k in known}
+    elsewhere = [k for k in known if k.rpartition(".")[2] == last and k not in others]
     meant = did_you_mean(elsewhere[0], elsewhere) if elsewhere else did_you_mean(last, beside, table + dot)
     return meant or f"known here are {', '.join(sorted(beside))}"
 

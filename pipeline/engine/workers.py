@@ -280,8 +280,11 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
             raise ConfigError("RIL-541", f"no dask scheduler answers at {where}", remedy="check the address") from error
     made = Dask(client, ours=client is not where)
     try:
-        while not made.threads():
-            time.sleep(WATCH_SECONDS)
+        if not made.threads():
+            asked = client.submit(bool, pure=False)  # an adaptive cluster starts workers where there is a task
+            while not made.threads():
+                time.sleep(WATCH_SECONDS)
+            asked.release()
         foreign.examine(client, cache)
     except BaseException:
         made.close(kill=True)

@@ -1,4 +1,4 @@
-"""Rasters read back: elevation models, from a GeoTIFF or ESRI ASCII grid or a run's folder, ortho images, disparities.
+"""Rasters read back: elevation models, from a GeoTIFF or ESRI ASCII grid or a run's folder, ortho images.
 
 Others may have written them: they are opened so that no file, nor one beside it, can name another that is then read.
 GDAL opens what a file says by any of its drivers: tiles of other files, addresses in the net. So the driver is given,
@@ -229,31 +229,6 @@ def read_ortho(path: Path) -> tuple[Grid, str]:
     grid = _placed(np.where(known, grey, np.nan), t)
     _check_known(path, grid)
     return grid, wkt
-
-
-def read_disparity(path: Path, shape: tuple[int, ...] = ()) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row disparity (row, col), float32 pixels, NaN undefined, of a TIFF as ``rille match`` writes it.
-
-    Parameters
-    ----------
-    shape : (rows, columns) that it must have; compared before anything is unpacked.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, its two bands are not those, or it has another size.
-    """
-    remedy = "give a TIFF with the bands column_disparity and row_disparity, as rille match writes"
-    with opened_raster(path) as file:
-        names = tuple(name for name in file.descriptions if name)
-        if file.count != 2 or names not in ((), ("column_disparity", "row_disparity")):
-            listed = ", ".join(names) or "without names"
-            raise InputError("RIL-622", f"{path} has {file.count} bands ({listed}), no disparity", remedy=remedy)
-        if shape and file.shape != shape:
-            text = f"{path} has {file.width} x {file.height} pixels, the left image {shape[1]} x {shape[0]}"
-            raise InputError("RIL-044", text, remedy="give a disparity of this left image")
-        column, row = file.read(out_dtype="float32", masked=True).filled(np.nan)
-    return np.ascontiguousarray(column), np.ascontiguousarray(row)
 
 
 def _check_cells(path: Path, shape: tuple[int, ...]) -> None:

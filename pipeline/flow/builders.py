@@ -16,7 +16,6 @@ from rille.pipeline.engine.keys import digest
 from rille.pipeline.flow import tiles
 from rille.pipeline.flow.products import Products
 from rille.stages.calibration.calibration import calibration_stage
-from rille.stages.calibration.mirror_check import mirror_check_stage
 from rille.stages.calibration.orientation import orientation_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
@@ -25,7 +24,6 @@ from rille.stages.core.declare import F, NoParams, Params, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import (
     CalibrationFacts,
-    MirrorFacts,
     OrientationFacts,
     RigFacts,
     SwapFacts,
@@ -252,11 +250,6 @@ class Builder:
         """Whether left and right of a pair are exchanged."""
         images = {camera: self.features(frame, camera) for camera in CAMERAS}
         return self.node(swap_check_stage, f"swap_check/{frame}", **images, frame=frame, rig=self.given_rig)
-
-    def mirrored(self, pair: int) -> Handle[MirrorFacts]:
-        """Whether one image of a pair is mirrored."""
-        images = {camera: self.image(pair, camera) for camera in CAMERAS}
-        return self.node(mirror_check_stage, f"mirror_check/{pair}", **images, rig=self.given_rig)
 
     def synchrony(self, label: str, pairs: Series[int], frames: Series[int]) -> Handle[SynchronyFacts]:
         """For each pair, the right image of the same time as the left one, among the three frames on either side."""

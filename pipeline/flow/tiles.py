@@ -12,10 +12,10 @@ from rille.pipeline.engine.runtime.environment import cores
 from rille.stages.core.declare import Params
 from rille.stages.hfvm import coarse, matcher
 from rille.stages.hfvm.image import Shape, tiles
-from rille.stages.hfvm.join_stage import hfvm_join_stage
 from rille.stages.hfvm.matcher import How, Tell, silent
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.tile_stage import hfvm_tile_stage
+from rille.stages.hfvm.tiles.join_stage import hfvm_join_stage
+from rille.stages.hfvm.tiles.tile_stage import hfvm_tile_stage
 from rille.stages.imaging.pyramid import PyramidParams, levels_of
 
 WHOLE_BYTES, TILE_BYTES = 170, 300

@@ -20,17 +20,6 @@ from rille.stages.core.errors import RilleError
 Maker = Callable[[Scene], Block | None]
 
 
-def _disparity(scene: Scene) -> Block | None:
-    """Disparity of the first basic pair along its baseline."""
-    view = scene.view
-    bundle = next((b for b in map(view.bundle, view.products.disparity.values()) if b is not None), None)
-    if bundle is None:
-        return None
-    band = strips.depth_band(view.sequence.rig)[0]
-    values, label = np.asarray(bundle[band]), band.replace("_", " ")
-    return Block((figures.raster(values, f"{label}, px", f"{label.capitalize()}, {spread(values)} px"),))
-
-
 def _trajectory(scene: Scene) -> Block | None:
     """Top view, and what is off along the path; None for fewer than two poses."""
     track, other, view = scene.track, scene.comparison, scene.view
@@ -159,7 +148,6 @@ OUTPUTS = (
         strips.drive,
         lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.products.accuracy),
     ),
-    _drawing("Disparity", _disparity, lambda run: (run.products.disparity, run.sequence.rig)),
     _drawing("Stops", strips.pairs, _of_stops),
     _drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
     _drawing("Trajectory", _trajectory, _of_trajectory),

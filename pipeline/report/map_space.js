@@ -41,7 +41,6 @@ const openSpace = (c, D, { at, height, sheet, eye }) => {
   const lines = [strip(D.path.map(lift), [0.07, 0.07, 0.07], gl.LINE_STRIP), strip(D.track.map((t) => t.slice(1, 4)), [0.04, 0.31, 0.54], gl.LINE_STRIP)];
   const onGround = (q) => { const k = at(q[0], q[1]), z = k < 0 ? NaN : height(k); return [q[0], q[1], z === z ? z : cz]; };
   for (const leg of Object.values(D.legs)) lines.push(strip(leg.map(onGround).map(lift), [0.07, 0.07, 0.07], gl.LINE_STRIP));
-  for (const f of D.frusta) lines.push(strip([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1].map((i) => f[i]), [0.55, 0.56, 0.6], gl.LINES));
   const texture = () => { gl.bindTexture(gl.TEXTURE_2D, T); gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, sheet); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE); gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE); };
   const render = () => {
     const ratio = window.devicePixelRatio || 1;

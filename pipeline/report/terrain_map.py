@@ -21,10 +21,8 @@ from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.strips import StripLine
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import mosaic
 from rille.stages.hazard.risk import REASONS, UNKNOWN
-from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.shading import slope_deg
 
 MAX_CELLS = 350_000
@@ -83,7 +81,6 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "colors": list(canvas.RISK),
         "ramp": base64.b64encode(canvas.ramp().tobytes()).decode("ascii"),
         "track": _track(scene),
-        "frusta": _frusta(scene),
         "path": _path(scene),
         "limit": vehicle.max_slope_deg,
         "vehicle": [vehicle.wheel_base + vehicle.wheel_diameter, vehicle.track],
@@ -155,24 +152,6 @@ def _track(scene: Scene) -> list[list[Any]]:
         [int(f), *(round(float(v), 5) if np.isfinite(v) else None for v in row)]
         for f, row in zip(frames, rows, strict=True)
     ]
-
-
-def _frusta(scene: Scene) -> list[Any]:
-    """Projection centre and the corners of the image at some distance, of the left camera at each basic pair."""
-    view = scene.view
-    bundle = view.bundle(view.products.trajectory)
-    if bundle is None:
-        return []
-    camera, frusta = view.sequence.rig.left, []
-    far = 2.0 * view.sequence.rig.baseline
-    # Pixel centres are whole numbers: the image begins half a pixel before the first.
-    right, foot = camera.width - 0.5, camera.height - 0.5
-    rays = camera.rays([(-0.5, -0.5), (right, -0.5), (right, foot), (-0.5, foot)])
-    points = np.vstack([np.zeros(3), far * rays])
-    for frame, pose in zip(bundle.meta["frames"], world_poses(bundle), strict=True):
-        if frame in view.products.disparity and np.isfinite(pose).all():
-            frusta.append(np.round(RigidTransform.from_matrix(pose).apply(points), 4).tolist())
-    return frusta
 
 
 def _path(scene: Scene) -> list[list[float | None]]:

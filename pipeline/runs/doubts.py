@@ -27,9 +27,10 @@ WHY_NOT = (
 
 
 def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
-    """The images, their 16-bit samples spread where they use a small part of their range, and a warning of it."""
-    used = levels.levels_of(images)
-    return [levels.spread(i, used) for i in images], [] if used is None else [warning("RIL-705", levels.words(used))]
+    """Left and right image, their 16-bit samples spread where they use a small part of their range, and warnings."""
+    used = levels.levels_of_sides(images[:1], images[1:])
+    lines = [warning("RIL-705", line) for line in levels.words(used)]
+    return [levels.spread(i, of) for i, of in zip(images, used, strict=True)], lines
 
 
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:
@@ -38,11 +39,8 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
     One that explains all others stands alone. ``closely``: compare samples of the images, too, which takes half a
     second.
     """
-    ok = matched_back(result.validity, result.backmatch_error)
-    # Of images of unlike size nobody knows how their middles correspond, and so which displacement far things have.
-    alike = left.shape == right.shape
     one = warning("RIL-708", "left and right are one image") if np.array_equal(left, right) else ""
-    explains_all = _unmatched(result) or _without_texture(result) or one or (_exchanged(result, ok) if alike else "")
+    explains_all = _unmatched(result) or _without_texture(result) or one
     if explains_all:
         yield explains_all
         return
@@ -51,7 +49,7 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
         text = f"the {which} image is blurred by {abs(result.unlike.blur):.1f} px beside the {other} one: out of focus?"
         yield warning("RIL-710", text)
     if closely:
-        yield from _wrong_matches(result, left, right, ok)
+        yield from _wrong_matches(result, left, right)
 
 
 def _unmatched(result: Any) -> str:
@@ -75,25 +73,11 @@ def _without_texture(result: Any) -> str:
     return warning("RIL-701", text) if share > 0.5 else ""
 
 
-def _exchanged(result: Any, ok: NDArray[np.bool_]) -> str:
-    """That displacements of the matches that are ``ok`` are those of a left image taken for the right one."""
+def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[str]:
+    """That matches contradict each other, or could as well be others."""
     from rille.stages.calibration import doubt
 
-    if not doubt.swapped(result.column_disparity, result.row_disparity, ok):
-        return ""
-    median = float(np.median(result.column_disparity[ok]))
-    text = (
-        f"disparities have the sign of swapped images (median {median:+.1f} px, right minus left): if this is "
-        "a pair of a left and a right camera, give them in the other order"
-    )
-    return warning("RIL-702", text)
-
-
-def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any], ok: NDArray[np.bool_]) -> Iterator[str]:
-    """That matches which are ``ok`` contradict each other, or could as well be others."""
-    from rille.stages.calibration import doubt
-
-    judged = doubt.judge(left, right, result, ok)
+    judged = doubt.judge(left, right, result, matched_back(result.validity, result.backmatch_error))
     if judged is None:
         return
     on_lines, repeated = judged

@@ -93,7 +93,6 @@ LIMITS = {
         Fault("RIL-670", "unusable", most=0, remedy="mend, convert or remove what is wrong"),
         Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
         InputLimit("RIL-677", "grey", most=0),
-        Fault("RIL-676", "mirrored", most=0, remedy="mirror that camera's images back"),
         InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),
     "exposure": (
@@ -116,7 +115,12 @@ LIMITS = {
             remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
             "rows in order (PFM has the lowest first)?",
         ),
-        Fault("RIL-656", "matched", least=0.02, remedy="do both images show one scene, taken at one time, and sharp?"),
+        Fault(
+            "RIL-656",
+            "matched",
+            least=0.02,
+            remedy="do both images show one scene, taken at one time, sharp, and neither mirrored?",
+        ),
         InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
         InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
     ),
@@ -386,15 +390,6 @@ def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given
         text += f", depth {near:.3g} to {far:.3g} m, median {middle:.3g} m"
         figures["baselines away"] = middle / baseline
     return judge("matching", text, figures)
-
-
-def judge_mirror(fitting: Mapping[str, float]) -> Finding | None:
-    """Which image is mirrored: those that make most matches fit once they are, and the share of these."""
-    if not fitting:
-        return None
-    share, which = max(fitting.values()), " or ".join(fitting)
-    text = f"{share:.0%} of the matches of the first pair's images fit the rig once {which}"
-    return judge("images", text, {"mirrored": len(fitting)})
 
 
 def judge_sides(beyond: float) -> Finding:

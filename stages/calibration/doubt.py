@@ -3,12 +3,7 @@
 They deserve doubt by two signs, which images show without calibration, each a share of a sample of the matches: those
 far from every epipolar line, as no rigid scene has them; and those that look as well elsewhere along their line, as on
 a repeating pattern, where each match may be off by a period.
-
-With the right camera on the right, nothing has a column displacement greater than infinitely far things have (right
-minus left). Without calibration that of far things is not known: cameras that converge by an angle t move them by
-D = f t. But they also make a keystone, a row displacement (t / f) x y about the image's middle, which matches show.
-The focal length f is between half and three times the image width, so D is k f^2 with k = t / f within bounds. Images
-are swapped for certain where nearly all displacements lie beyond the upper one."""
+"""
 
 from __future__ import annotations
 
@@ -21,8 +16,6 @@ from numpy.typing import NDArray
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.hfvm.image import thinned
-from rille.stages.numeric.least_squares import irls
-from rille.stages.numeric.robust import cauchy
 
 MIN_MATCHES = 100
 """Matches that a judgement needs at least."""
@@ -128,49 +121,3 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
 def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
     last = np.array([shape[1] - 1 - margin, shape[0] - 1 - margin])
     return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
-
-
-def swapped(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> bool:
-    """Whether left and right image of a stereo rig must have been swapped; False also where nobody can know.
-
-    Parameters
-    ----------
-    column, row : (row, col) disparities, pixels, right minus left.
-    matched : (row, col) bool, which to trust.
-    """
-    places = sample(column, row, matched)
-    if places is None:
-        return False
-    (x, y), (u, v) = places[0].T, (places[1] - places[0]).T
-    width = matched.shape[1]
-    k, sigma = _keystone((x - 0.5 * (width - 1)) / width, (y - 0.5 * (matched.shape[0] - 1)) / width, u, v)
-    # In units of the image width k is D in pixels for a focal length of one width.
-    most = k + 3.0 * sigma
-    # Fields of view of 90 and 19 degrees: .5 and 3 image widths. A keystone may be negative: then the short focal
-    # length gives the upper bound.
-    bound = max(most * 0.5**2, most * 3.0**2)
-    # Nearly all have to lie beyond the bound, and a pixel beyond it proves nothing.
-    return bool(np.percentile(u, 10.0) > bound + 1.0)
-
-
-def _keystone(x: AnyArray, y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[float, float]:
-    """Factor of x y in the row displacements, pixels, and its standard deviation, robustly (Cauchy weights).
-
-    Other terms: row offset, roll, scale, relative pitch, baseline across the rows, one camera before the other.
-    """
-    depth = (u - u.mean()) / max(float(u.std()), 1e-6)
-    terms = np.stack([x * y, np.ones_like(x), x, y, y * y, depth, depth * y], -1)
-    spread = 1e-3
-
-    def weigh(residual: AnyArray) -> AnyArray:
-        # Rows that agree exactly leave residuals of zero to divide by.
-        nonlocal spread
-        spread = max(1.5 * float(np.median(np.abs(residual))), 1e-3)
-        return cauchy(residual, spread)
-
-    # A flat scene has no depth, whose terms are zero: without a hold the matrix would be singular.
-    hold = 1e-9 * len(x) * np.eye(terms.shape[1])
-    solution = irls(terms, v, weigh, hold, np.zeros(terms.shape[1]), rounds=8)
-    weight = weigh(terms @ solution - v)
-    normal = (terms * weight[:, None]).T @ terms + hold
-    return float(solution[0]), spread * float(np.sqrt(np.linalg.inv(normal)[0, 0]))

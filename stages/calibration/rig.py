@@ -361,7 +361,7 @@ def rig_stage(
     facts = orient_rig(rig, pairs, params, first, float(np.mean(shares)) if shares else 0.0)
     opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
     both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened
-    if pairs and (misread := better_reading(rig, both, pairs)):
+    if "matches" in facts and (misread := better_reading(rig, both, pairs)):
         facts["misread"] = misread
         facts["warnings"].insert(0, misread)
     return Bundle({}, facts)

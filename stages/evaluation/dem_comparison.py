@@ -148,20 +148,6 @@ def errors(a: Grid, b: Grid, T_b_a: RigidTransform | None = None) -> Floats:
     return np.asarray(moved[..., 2] - b.at(moved[..., :2]))
 
 
-def relief_factor(a: Grid, b: Grid) -> float:
-    """Factor of B's elevations that explains nine tenths of A's but for a plane (runs may lean); 1 where none does."""
-    known = np.argwhere(np.isfinite(errors(a, b)))
-    if len(known) < 100:
-        return 1.0
-    row, col = known[:: len(known) // MAX_POINTS + 1].T
-    z = np.stack([a.values[row, col], b.values[row, col]], axis=-1)
-    plane = np.stack([row, col, np.ones(len(z))], axis=-1)
-    relief = z - plane @ np.linalg.lstsq(plane, z)[0]
-    (saa, sab), (_, sbb) = relief.T @ relief
-    # Where a factor explains nine tenths of the relief's variance.
-    return float(sab / sbb) if sab**2 > 0.9 * saa * sbb else 1.0
-
-
 def figures(error: Floats) -> dict[str, float]:
     """RMSE, NMAD, 95 % of the absolute errors, bias and median (m) of the finite errors, and their number ``cells``."""
     e = error[np.isfinite(error)]

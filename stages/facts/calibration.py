@@ -73,13 +73,6 @@ class SwapFacts(Facts):
     exchanged: NotRequired[float]
 
 
-class MirrorFacts(Facts):
-    """Whether a pair fits its rig once an image is mirrored."""
-
-    fitting: dict[str, float]
-    """Which image and which way, in words, and the share of the matches that fit then; of more than half."""
-
-
 class SynchronyFacts(Facts):
     """Right frames that are of the time of left ones."""
 

@@ -4,10 +4,10 @@
 
     coarse levels (whole) -> fine (each window) -> ending (lines and planes of the whole) -> final (each window)
 
-Each step takes what is known of every pixel and returns more of it: fractions of a pixel, validity (4.3.1, 4.3.3),
-refinement, isolated patches; then planes and filling. All work on a window of the left image, and on windows of the
-right image that hold what the left one's matches reach. All but a thousandth of the pixels are within .01 px of the
-result of the pair matched in one window: tiles do not see patches and propagation that reach beyond the halo."""
+The steps of a window: sub-pixel displacements, validation (4.3.1, 4.3.3), refinement, isolated patches; then planes and
+filling. Each takes the arrays of the step before. They work on a window of the left image and on the window of the
+right image that its matches reach. All but a thousandth of the pixels are within .01 px of the result of the pair
+matched in one window: patches and propagation that reach beyond the halo are cut off by tiles."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ from rille.stages.hfvm.refinement import local_mean
 from rille.stages.numeric.windows import window_count, window_room
 
 FAILED_PX = np.float32(1e9)
-"""Back-matching error where there is nothing to match back from."""
+"""Back-matching error of pixels whose match is not a usable pixel of the right image."""
 
 CROWD_SIDE_PX = 9
-"""Pixels: side of the neighbourhood in which matches support each other, about that of the features."""
+"""Pixels: side of the neighbourhood in which matches support each other, about that of a feature window."""
 
 NO_PATCH = -32768
 """Displacement of pixels that are in no patch."""
@@ -103,11 +103,11 @@ def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
 
 
 def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
-    """Pixels of ``keep`` in patches of fewer than ``size``; where most of the rest lies in small ones, those too.
+    """Pixels of ``keep`` in patches of fewer than ``size`` pixels; if most pixels lie in small patches, all of those.
 
-    Patches hang together along rows and columns where column displacements differ by at most one pixel. Images that
-    have nothing to do with each other match by chance in patches up to some hundred pixels. Of a pair that shows one
-    scene nearly everything lies in patches of thousands: there small ones are believed.
+    Pixels of a patch are connected along rows and columns by column displacements that differ by at most one pixel.
+    Unrelated images match by chance in patches of up to some hundred pixels. In a pair of one scene nearly all matches
+    lie in patches of thousands, and small patches are kept.
 
     Parameters
     ----------
@@ -115,8 +115,8 @@ def isolated(u: AnyArray, keep: AnyArray, size: int) -> NDArray[np.bool_]:
     """
     if size <= 1:
         return np.zeros(keep.shape, dtype=bool)
-    # 16 times the size: no patch of chance is as large (measured on blurred noise: up to 8 times). In a small image
-    # they may not fit: an eighth of it is enough.
+    # 16 times the size: no patch of chance is as large (measured on blurred noise: up to 8 times). A small image may
+    # not hold such a patch: an eighth of it is enough.
     suspect = _in_small_patches(u, keep, max(size, min(16 * size, keep.size // 8)))
     # The smaller patches are among these, and most matches are not.
     small = _in_small_patches(u, suspect, size)
@@ -139,9 +139,9 @@ Results = Mapping[str, AnyArray]
 class FinestWork:
     """Windows of both images at the finest level, and their matches.
 
-    ``b``: the right image as it was matched, ``right``: as it is; two names of one unless ``alignment``, the homography
-    from the one to the other, is given. ``left, back``: whole displacements of the left window in that of ``b``, and
-    the reverse. ``images``: whose windows they are. ``upright``: see :class:`rille.stages.hfvm.level.State`; ``blur``:
+    ``b``: the right image as it was matched, ``right``: as it came; the same image unless ``alignment``, the homography
+    from the one to the other, is given. ``left, back``: integer displacements from the left window to that of ``b``,
+    and back. ``images``: the images of the windows. ``upright``: see :class:`rille.stages.hfvm.level.State`; ``blur``:
     :func:`rille.stages.hfvm.coarse.focus`.
     """
 
@@ -157,12 +157,12 @@ class FinestWork:
 
     @cached_property
     def alike(self) -> FinestWork:
-        """The same with the detail that both images show."""
+        """The same with the sharper image blurred to the detail of the other one."""
         left, right = self.blur
         return replace(self, a=self.a.blurred(left), b=self.b.blurred(right), right=self.right.blurred(right))
 
     def to_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Displacements in the window of the right image, of those in the window of ``b``."""
+        """Displacements to the window of the right image, from displacements to the window of ``b``."""
         return self._carried(u, v, self.b, self.right)
 
     def from_right(self, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
@@ -178,15 +178,15 @@ class FinestWork:
         return u - np.float32(c.x0 - a.x0), v - np.float32(c.y0 - a.y0)
 
     def compared(self) -> refinement.SplineImages:
-        """What refinement compares."""
+        """The images that refinement compares."""
         return refinement.SplineImages(self.a.grey, spline.coefficients(self.right.grey), self.right.valid)
 
 
 @dataclass(frozen=True)
 class Fine:
-    """What is known of each pixel, (row, col): displacements to ``b``, float32 pixels; bits that speak against it
-    (:class:`~rille.stages.core.validity.Validity`); back-matching error, pixels; feature distance, -1 outside; and the
-    variance of the column displacement, on upright lines the row's, that noise makes, squared pixels."""
+    """Result of the steps so far, (row, col): displacements to ``b``, float32 pixels; ``validity``, reasons to reject a
+    pixel (:class:`~rille.stages.core.validity.Validity`); back-matching error, pixels; feature distance, -1 outside;
+    ``noise``, the variance of the column displacement (of the row's on upright lines) by noise, squared pixels."""
 
     u: AnyArray
     v: AnyArray
@@ -197,18 +197,18 @@ class Fine:
 
     @property
     def keep(self) -> NDArray[np.bool_]:
-        """Pixels that nothing speaks against."""
+        """Pixels that no step has rejected."""
         return np.asarray(self.validity == 0)
 
     def against(self, where: NDArray[np.bool_], bit: Validity) -> AnyArray:
-        """Validity with one more bit where ``where``."""
+        """Validity with ``bit`` set where ``where``."""
         validity = self.validity.copy()
         mark(validity, where, bit)
         return validity
 
 
 def subpixel(work: FinestWork) -> Fine:
-    """Fractions of a pixel from distances summed over 5 x 5 pixels, and means of like neighbours (4.3.2)."""
+    """Sub-pixel displacements from distances summed over 5 x 5 pixels, averaged over like neighbours (4.3.2)."""
     everywhere = np.ones(work.left.u.shape, np.uint8)
     u, v, distance = solver.sums(LevelPair(work.a.words, work.b.words), *work.left, everywhere)
     u, v = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
@@ -219,7 +219,7 @@ def subpixel(work: FinestWork) -> Fine:
 def reasons(
     there: Map, back: Map, distance: AnyArray, layers: tuple[Layer, Layer], params: HfvmParams, deviation: AnyArray
 ) -> tuple[AnyArray, AnyArray]:
-    """Back-matching errors (4.3.3), pixels, and bits that speak against each pixel: they, distance, texture.
+    """Back-matching errors (4.3.3), pixels, and validity: reasons to reject by that error, distance, or texture.
 
     ``there, back``: displacements of the ``layers``, (row, col) float32; ``deviation``: of the left one.
     """
@@ -236,8 +236,8 @@ def reasons(
 
 
 def check(work: FinestWork, fine: Fine) -> Fine:
-    """Reasons against each pixel: matching back (4.3.3), distance, texture."""
-    # Back from the right whole displacements suffice.
+    """Reject pixels by back-matching (4.3.3), feature distance, and texture."""
+    # Integer displacements suffice for the way back.
     u, v = (a.astype(np.float32) for a in work.back)
     back = Map(*local_mean(u, v, np.ones(u.shape, bool), 2, 2))
     found = Map(fine.u, fine.v), back, fine.distance, (work.a, work.b), work.images.params, work.a.deviation
@@ -246,7 +246,7 @@ def check(work: FinestWork, fine: Fine) -> Fine:
 
 
 def refine(work: FinestWork, fine: Fine) -> Fine:
-    """Displacements without the perspective bias, by mean-free Lucas-Kanade steps; what does not correlate goes."""
+    """Remove the perspective bias by mean-free Lucas-Kanade steps, and reject pixels that do not correlate."""
     keep, work = fine.keep, work.alike
     # An image that a plane has aligned is sheared, and takes a step more.
     how = 1 if work.alignment is None else 2, work.upright
@@ -254,8 +254,8 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     removed = work.images.left.noise**2, work.images.right.noise**2
     deviations = work.a.deviation, nearest(work.b.deviation, Map(u, v))
     alike, variance = refinement.surroundings(rest, deviations, keep, removed)
-    # Denoising takes means of nine pixels: it divides the residuals' variance by as many; no match is placed better. A
-    # blur takes the noise of one image of two.
+    # Denoising averages nine pixels and divides the variance of the residuals by as many; matches are no more exact for
+    # that. Blurring removes the noise of one image of the two.
     hidden = (9.0 if any(removed) else 1.0) * (2.0 if any(work.blur) else 1.0)
     noise = per_noise * (variance * np.float32(hidden))
     validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)
@@ -263,26 +263,26 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
 
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
-    """A piecewise smooth relief fitted to all matches along their epipolar lines."""
+    """Fit a piecewise smooth relief to all matches along their epipolar lines."""
     work = work.alike
     u, v = work.from_right(*refinement.fit_relief(work.compared(), *work.to_right(fine.u, fine.v), fine.keep))
     return replace(fine, u=u, v=v)
 
 
 def landing(work: FinestWork, fine: Fine) -> Fine:
-    """Reasons against pixels whose match is not in the right image."""
+    """Reject pixels whose match is not in the right image."""
     there = lands(*work.to_right(fine.u, fine.v), fine.keep, work.right.valid)
     return replace(fine, validity=fine.against(fine.keep & ~there, Validity.OUT_OF_IMAGE))
 
 
 def speckles(work: FinestWork, fine: Fine) -> Fine:
-    """Reasons against pixels in small isolated patches, most of which are errors."""
+    """Reject pixels in small isolated patches, most of which are errors."""
     small = isolated(work.left.v if work.upright else work.left.u, fine.keep, work.images.params.speckle)
     return replace(fine, validity=fine.against(small, Validity.SPECKLE))
 
 
 def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matrix | None:
-    """Fundamental matrix of the refined matches (``u, v, validity``) of a whole image; None: they follow no lines."""
+    """Fundamental matrix of the refined matches (``u, v, validity``) of a whole image; None if they fit none."""
     y, x = thinned(results["validity"] == 0, MAX_FIT_MATCHES)
     fitted = epipolar.fit_points(x, y, results["u"][y, x], results["v"][y, x], *shapes)
     # Negated, so that NaN is refused as well.
@@ -293,9 +293,9 @@ def fitted_lines(results: Results, shapes: tuple[Shape, Shape]) -> epipolar.Matr
 
 @dataclass(frozen=True)
 class Ending:
-    """What the whole left image, of ``shape``, tells a window for its last steps: the sign of depth (see
-    ``level.State``), the homography that the right image was aligned by, epipolar lines of the matches, planes
-    without texture, and whether lines are ``upright``."""
+    """Results of the whole left image, of ``shape``, for the last steps of its windows: the sign of depth (see
+    ``level.State``), the homography by which the right image was aligned, the fundamental matrix of the matches, planes
+    of textureless regions, and whether epipolar lines are ``upright``."""
 
     shape: Shape
     near_sign: float = NEAR_SIGN
@@ -328,18 +328,18 @@ def complete(
         # Error, distance and validity of the former displacement do not apply.
         error[on_plane], distance[on_plane], validity[on_plane] = FAILED_PX, -1.0, 0
     beside, matches = region < 0, keep | on_plane
-    # Matches with too few agreeing neighbours are too uncertain to count as measured, but remain the best guess.
+    # Matches with few matched neighbours are too uncertain to count as measured, but are kept as filled values.
     alone = lonely(matches, params.min_support)
     mark(validity, alone, Validity.SPECKLE)
     filled = (alone | beside).astype(np.uint8)
     along, across, known, done = u, v, matches | beside, filled
     if ending.upright:
-        # Of the maps as they lie, columns are rows, and row displacements show depth.
+        # Row displacements show depth: fill the transposed maps.
         along, across, known, done = v.T, u.T, known.T, done.T
     fill_rows(along, across, known, params.fill_reach, ending.near_sign or -1.0, done)
     if ending.f is not None:
         f = epipolar.moved(ending.f, *2 * ((window.x0, window.y0),))
-        # A filled pixel has its neighbour's depth, not its row: between turned cameras rows change along a row.
+        # A filled pixel takes its neighbour's depth but its own epipolar line: on turned rigs rows change along a row.
         across[:] = epipolar.settled(epipolar.transposed(f) if ending.upright else f, along, across, done)
     matches &= ~alone
     std = refinement.standard_deviation(results["noise"], v if ending.upright else u, keep & ~alone)
@@ -348,12 +348,12 @@ def complete(
     filled[valid == 0] = 0
     if ending.alignment is not None:
         u, v = plane.carried(plane.to_original(ending.alignment, ending.shape), u, v, window.x0, window.y0)
-        # Found in pixels of the aligned image, as displacements were.
+        # From pixels of the aligned image to pixels of the right one.
         std = std * np.float32(effective(plane.scale(ending.alignment, ending.shape)))
     mark(validity, matches, Validity.MATCHED)
     mark(validity, filled != 0, Validity.INTERPOLATED)
     unknown = ~matches & (filled == 0)
-    # FAILED_PX and -1 are for comparisons; what is published says NaN.
+    # FAILED_PX and -1 serve comparisons; the results have NaN.
     for array, none in ((u, unknown), (v, unknown), (error, error >= FAILED_PX), (distance, distance < 0)):
         np.copyto(array, np.float32(np.nan), where=none)
     return {
@@ -383,7 +383,7 @@ def match_finest_level(pair: Coarse, window: Window) -> dict[str, AnyArray]:
     outer = window.grow(HALO_PX, HALO_PX, shape)
     state, target = _around(pair, outer)
     a, b = images.left.cut(outer), images.right.cut(target)
-    # 1.1: pixels of blur up to which features bear it better than the loss of detail.
+    # 1.1: pixels of blur from which features lose more by it than by blurring the sharper image.
     if max(pair.blur) >= 1.1:
         a, b = (Image((k.layers[0].blurred(s),), k.noise) for k, s in zip((a, b), pair.blur, strict=True))
     if state.level > 0:
@@ -429,16 +429,16 @@ def _landing(work: FinestWork, shape: Shape) -> Window:
         return whole(shape)
     u, v = work.to_right(work.left.u.astype(np.float32), work.left.v.astype(np.float32))
     y, x = np.arange(a.y0, a.y1)[:, None] + v, np.arange(a.x0, a.x1) + u
-    # Relative to the window that stands there until this one is known.
+    # ``work.right`` still is the window of the aligned image, and ``to_right`` counts from its corner.
     x, y = x - a.x0 + work.right.window.x0, y - a.y0 + work.right.window.y0
     ends = Window(*(int(n) for n in (np.nanmin(y), np.nanmax(y) + 1, np.nanmin(x), np.nanmax(x) + 1)))
     return ends.grow(TARGET_MARGIN_PX, TARGET_MARGIN_PX, shape)
 
 
 def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Ending:
-    """What the matches of the whole image tell its windows: their epipolar lines, and planes without texture."""
+    """Epipolar lines of the matches of the whole image, and planes of its textureless regions."""
     images, sign, shapes = pair.images, pair.state.near_sign, (pair.images.left.shapes[0], pair.images.right.shapes[0])
-    # Without a band rows are free: they are not to be set by lines.
+    # Without a band row displacements are free, and no line may set them.
     free = images.params.band == 0 or images.levels <= textureless.REGION_LEVEL
     f, planes = None if free else fitted_lines(matches, shapes), None
     if f is not None and "planes" not in images.params.without:
@@ -447,7 +447,7 @@ def fit_lines_and_planes(pair: Coarse, matches: Mapping[str, AnyArray]) -> Endin
 
 
 def around(pair: Coarse, window: Window) -> Window:
-    """Window that :func:`interpolate_undefined` needs the arrays of."""
+    """Window whose arrays :func:`interpolate_undefined` needs."""
     reach = pair.images.params.fill_reach
     down, aside = (reach, 0) if pair.state.upright else (0, reach)
     # 16: pixels around a window that its filling and standard deviations depend on, besides the reach along lines.
@@ -466,7 +466,7 @@ def interpolate_undefined(
 
 
 def put_together(calls: Mapping[Window, Call], shape: Shape, threads: int) -> dict[str, AnyArray]:
-    """Arrays of an image of ``shape``, from those that calls make of its windows, ``threads`` at a time."""
+    """Arrays of an image of ``shape``, put together from the results of ``calls``, one a window, in ``threads``."""
     parts = side_by_side(list(calls.values()), threads)
     if len(parts) == 1:
         return parts[0]

@@ -22,21 +22,14 @@ from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import finest, matcher, refinement
-from rille.stages.hfvm.coarse import (
-    MIN_LOG_RATIO,
-    PriorDisparities,
-    Unlike,
-    greatest,
-    impose,
-    known_beforehand,
-    levelled,
-    ratio_of_matches,
-)
+from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, levelled, ratio_of_matches
+from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
 from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.prior import PriorDisparities, impose, known_beforehand
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
 

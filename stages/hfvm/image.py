@@ -297,8 +297,8 @@ Grey = tuple[AnyArray, AnyArray]
 
 @dataclass(frozen=True)
 class Layer:
-    """A level of an image, or a window of it. ``read``: grey values of any window; ``shape``: of the level; ``blur``:
-    standard deviation of a Gaussian that it is seen through, pixels."""
+    """A level of an image, or a window of it. ``read``: returns grey values of any window; ``shape``: of the level;
+    ``blur``: standard deviation of the Gaussian that it was blurred by, pixels."""
 
     read: Callable[[Window], Grey]
     shape: Shape
@@ -316,7 +316,7 @@ class Layer:
         return replace(self, window=window)
 
     def blurred(self, deviation: float) -> Layer:
-        """The same seen through a Gaussian, ``deviation`` in pixels; itself where it is already."""
+        """The same blurred by a Gaussian of this ``deviation``, pixels; itself if it already is."""
 
         def read(window: Window) -> Grey:
             grey, mask = self.read(window)
@@ -375,7 +375,7 @@ class Image:
         return Image((self.layers[0].cut(window),), self.noise)
 
     def changed(self, change: Callable[[Callable[[Window], Grey], int, Window], Grey], noise: float) -> Image:
-        """The image read by ``change(reader, level, window)``."""
+        """The image with its windows read by ``change(reader, level, window)``."""
         layers = tuple(replace(layer, read=partial(change, layer.read, n)) for n, layer in enumerate(self.layers))
         return Image(layers, noise)
 
@@ -386,7 +386,7 @@ def _stored(images: Sequence[AnyArray], masks: Sequence[AnyArray], level: int, w
     if mask.all():
         return image, mask
     if level + 1 == len(images):
-        # At the top there is no level above: the mean of what is seen.
+        # The top has no level above: masked pixels take the mean of the usable ones.
         everything = whole(masks[level].shape).slices
         top, usable = images[level][everything], masks[level][everything] != 0
         return np.where(mask, image, top[usable].mean() if usable.any() else np.float32(0.0)), mask
@@ -396,7 +396,7 @@ def _stored(images: Sequence[AnyArray], masks: Sequence[AnyArray], level: int, w
 
 
 def as_given(given: Pyramid, weights: Weights) -> Image:
-    """Image of a pyramid, whose levels and masks are arrays, or rasters that are read by window."""
+    """Image of a pyramid; its levels and masks are arrays, or rasters read by window."""
     read = partial(_stored, given.images, given.valid)
     return Image(tuple(Layer.of(partial(read, n), m.shape, weights) for n, m in enumerate(given.valid)))
 
@@ -414,7 +414,7 @@ def _denoised(noise: float, read: Callable[[Window], Grey], level: int, window: 
 
 
 def lee(image: AnyArray, noise: float) -> Floats32:
-    """Denoised grey values (row, col): noise is averaged where texture is hardly stronger, and left elsewhere.
+    """Denoised grey values (row, col): means where texture is hardly stronger than noise, unchanged elsewhere.
 
     With mean m and variance s^2 of the 3 x 3 pixels around it and noise of standard deviation n, a grey value a becomes
 
@@ -435,7 +435,7 @@ def lee(image: AnyArray, noise: float) -> Floats32:
 @njit(cache=True, nogil=True)
 def _lee(image, excess, denoised):  # type: ignore[no-untyped-def]
     middle, ninth, nil = np.float32(128.0), np.float32(1.0 / 9.0), np.float32(0.0)
-    # What rounding may leave of the variance of a flat window, or take from it, squared grey levels.
+    # Rounding error of the variance of a flat window, squared grey levels.
     least = np.float32(1e-3)
     sums, squares = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.float32)
     for y in range(denoised.shape[0]):

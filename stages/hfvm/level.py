@@ -29,11 +29,11 @@ from rille.stages.hfvm.plane import Sample
 
 @njit(cache=True, nogil=True)
 def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-def]
-    """Interpolate undefined disparities along rows, in place; ``filled`` gets 1 where it happened.
+    """Interpolate undefined disparities along rows, in place; ``filled`` is set to 1 at the interpolated pixels.
 
-    A gap between values that agree within two pixels is a failed match and gets the line between them; another gap is
-    an occlusion and gets its background: the side of lesser ``near_sign * u`` (-1: near things lie left in the right
-    image). No value travels farther than ``reach`` pixels.
+    A gap between values that agree within two pixels is a failed match: it is interpolated linearly. Any other gap is
+    an occlusion: it takes the background's value, that of the side with the lesser ``near_sign * u`` (-1: nearer
+    things have lesser displacements). Values are carried at most ``reach`` pixels.
     """
     height, cols = u.shape
     for y in range(height):
@@ -47,7 +47,7 @@ def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-
                 x += 1
             a, b = start - 1, x
             for i in range(start, x):
-                # Bounded, so that a tile knows how far beside it values may come from.
+                # Bounded, so that the halo of a tile holds all values that are carried into it.
                 from_a = a >= 0 and i - a <= reach
                 from_b = b < cols and b - i <= reach
                 if not from_a and not from_b:
@@ -67,7 +67,7 @@ def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-
 
 
 MAX_FIT_MATCHES = 500
-"""Matches that a band or plane is fitted to; more change nothing that matters and cost time."""
+"""Matches that a band or a plane is fitted to; more cost time and hardly change the fit."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,9 @@ NEAR_SIGN = -1.0
 
 @dataclass(frozen=True)
 class State:
-    """Result of one level: both maps, which left and right pixels are consistent, band of the next finer level, and
-    sign of depth: -1 where nearer things have lesser displacements in columns, on ``upright`` lines in rows, +1
-    greater, 0 unknown."""
+    """Result of one level: displacements of both images, their consistent pixels, the band of the next finer level,
+    and the sign of depth: -1 where nearer things have lesser displacements (of columns; of rows where lines are
+    ``upright``), +1 where they have greater ones, 0 unknown."""
 
     level: int
     left: Map
@@ -104,7 +104,7 @@ class State:
 
     @property
     def upright(self) -> bool:
-        """Whether epipolar lines run along the columns, as far as is known: depth then shows in the rows."""
+        """Whether epipolar lines run along the columns, so that depth shows in the rows; False without a band."""
         return not epipolar.along_rows(self.band.f, self.left.u.shape)
 
     def reverse(self) -> State:
@@ -114,9 +114,9 @@ class State:
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the steps of a level look at: both images there, the prediction handed down (None at the top), the band, and
-    the rounds of propagation. ``level``: 0 is the finest. ``near_sign``: see :class:`State`."""
+class LevelInput:
+    """Input of the steps of a level: both images, the prediction of the level above (None at the top), the epipolar
+    band, and the rounds of propagation. ``level``: 0 is the finest. ``near_sign``: see :class:`State`."""
 
     level: int
     a: Layer
@@ -129,20 +129,20 @@ class Look:
 
     @property
     def pair(self) -> LevelPair:
-        """What the solver takes."""
+        """Features and band, as the solver takes them."""
         return LevelPair(self.a.words, self.b.words, self.band.f, self.band.mu)
 
 
-Step = Callable[[Look, Field], Field]
+Step = Callable[[LevelInput, Field], Field]
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A preset as lists of steps: of every level, further ones of the finest, and those after fractions of a pixel.
+    """A preset as lists of steps: of every level, additional ones of the finest level, and of the sub-pixel refinement.
 
-    ``rounds``: limits of the propagation at the finest level, from left to right, and from right to left, which serves
-    the check of consistency alone; each coarser level has one more, at most ``HfvmParams.rounds``. ``refinement``:
-    steps of :mod:`rille.stages.hfvm.finest`. ``half``: images are matched at half their resolution.
+    ``rounds``: most rounds of propagation at the finest level, from left to right, and from right to left, which only
+    the consistency check needs; each coarser level has one more, at most ``HfvmParams.rounds``. ``refinement``: steps
+    of :mod:`rille.stages.hfvm.finest`. ``half``: images are matched at half their resolution.
     """
 
     every: tuple[Step, ...]
@@ -154,7 +154,8 @@ class Recipe:
 
 @dataclass(frozen=True)
 class PyramidPair:
-    """The left and the right image as they are matched, and how; two ``threads`` match both directions side by side."""
+    """The left and the right image, as they are matched, with parameters and preset. With two ``threads`` both
+    directions are matched side by side."""
 
     left: Image
     right: Image
@@ -168,70 +169,71 @@ class PyramidPair:
 
     @property
     def levels(self) -> int:
-        """Levels that both have."""
+        """Number of levels that both images have."""
         return min(len(self.left.layers), len(self.right.layers))
 
 
-def search(look: Look, field: Field) -> Field:
-    """Best displacements around the predictions; at the top around none (4.3.1, Eq. 2 and 3)."""
-    p = look.params
-    if look.up is not None:
-        # A row above and below: rows are nearly right from the level above on.
-        solver.search(look.pair, look.up, (p.search_columns, 1), field)
+def search(given: LevelInput, field: Field) -> Field:
+    """Displacements of least cost around the predictions; at the top of the whole range (4.3.1, Eq. 2 and 3)."""
+    p = given.params
+    if given.up is not None:
+        # One row above and below: the level above has rows nearly right.
+        solver.search(given.pair, given.up, (p.search_columns, 1), field)
         return field
-    rows, cols = np.maximum(look.a.words.shape, look.b.words.shape)
-    exhaustive(look.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)
+    rows, cols = np.maximum(given.a.words.shape, given.b.words.shape)
+    exhaustive(given.pair, (int(np.ceil(p.top_columns * cols)), int(np.ceil(p.top_rows * rows))), field)
     return field
 
 
-def propagate(look: Look, field: Field) -> Field:
-    """Displacements improved by the neighbours'."""
-    # Row displacements are found on the coarser levels, where trying them costs little. On the finest level, which
-    # costs most, a single round only tries jumps: the search has just tried the neighbouring columns.
-    beside = 2 if look.level > 0 else 1 if look.rounds > 1 else 0
-    solver.propagate(look.pair, field, Smoothing(look.params.smoothness, look.rounds, beside))
+def propagate(given: LevelInput, field: Field) -> Field:
+    """Displacements after propagation: a pixel takes a neighbour's displacement where it costs less."""
+    # Row displacements are tried on the coarser levels, where that costs little. On the finest level, which costs most,
+    # a single round tries jumps alone: the search has just tried the neighbouring columns.
+    beside = 2 if given.level > 0 else 1 if given.rounds > 1 else 0
+    solver.propagate(given.pair, field, Smoothing(given.params.smoothness, given.rounds, beside))
     return field
 
 
-def paths(look: Look, field: Field) -> Field:
+def paths(given: LevelInput, field: Field) -> Field:
     """Displacements chosen by costs gathered along paths from the borders of the image.
 
-    A pixel's candidates are its own displacement and those a pixel beside it, those of near and farther pixels, and
-    those handed down, without which a wrong plane can take hold in images of unlike brightness. Along six directions
-    (eight but for those within a row) each gathers the least cost of getting there, smoothness included; so evidence
-    travels over weak texture as far as it must, and stops at depth edges.
+    Candidates of a pixel are its own displacement and those beside it by a pixel, those of near and farther pixels, and
+    those of the level above, without which a wrong plane can prevail in images of unlike brightness. Along six
+    directions (all eight but the two within a row) each candidate sums up the least cost of a path that ends in it,
+    smoothness included; so evidence is carried over weak texture and stops at depth edges.
     """
-    handed = np.zeros((0, 0), np.int32) if look.up is None else pack_map(2 * look.up.u, 2 * look.up.v)
-    solver.paths(look.pair, LevelPair(look.a.compact, look.b.compact), handed, look.a.grey, field.shift)
+    handed = np.zeros((0, 0), np.int32) if given.up is None else pack_map(2 * given.up.u, 2 * given.up.v)
+    solver.paths(given.pair, LevelPair(given.a.compact, given.b.compact), handed, given.a.grey, field.shift)
     return field
 
 
-def median(look: Look, field: Field) -> Field:
-    """Plain median of 3 x 3 pixels: before the check of consistency, where an outlier of one map refutes the other."""
+def median(given: LevelInput, field: Field) -> Field:
+    """Median of 3 x 3 pixels, since an outlier of one map fails right matches of the other in the consistency check."""
     return Field(pack_map(*(cv2.medianBlur(plane, 3) for plane in unpacked(field.shift))), field.cost)
 
 
-def edges(look: Look, field: Field) -> Field:
-    """Depth edges placed anew: near one a pixel chooses between the displacements on both sides, by small windows.
+def edges(given: LevelInput, field: Field) -> Field:
+    """Displacements with depth edges refined: near an edge a pixel takes that of either side, by small windows.
 
     Each candidate d of a pixel p costs
 
         C(d) = sum over q near p of w(p, q) min(D(q, q + d), far),   w(p, q) = max(grey - |I(p) - I(q)|, 0),
 
-    with D the distance of the compact features, which reach one pixel, and I the grey values: pixels like p count,
-    since they mostly lie on its surface. Adaptive support weights: Yoon and Kweon (2006), doi:10.1109/TPAMI.2006.70.
+    with D the distance of the compact features, which reach one pixel, and I the grey values: pixels of like grey have
+    weight, since most of them lie on the same surface. Adaptive support weights: Yoon and Kweon (2006),
+    doi:10.1109/TPAMI.2006.70.
     """
-    wanted = (look.a.deviation >= look.params.texture) & (look.a.valid != 0)
-    pair, grey = LevelPair(look.a.compact, look.b.compact), np.rint(look.a.grey).astype(np.int16)
-    # On upright lines columns do not tell near from far.
-    sign = int(look.near_sign) if epipolar.along_rows(look.band.f, wanted.shape) else 0
+    wanted = (given.a.deviation >= given.params.texture) & (given.a.valid != 0)
+    pair, grey = LevelPair(given.a.compact, given.b.compact), np.rint(given.a.grey).astype(np.int16)
+    # On upright lines column displacements do not show depth.
+    sign = int(given.near_sign) if epipolar.along_rows(given.band.f, wanted.shape) else 0
     return Field(solver.edges(pair, grey, field.shift, wanted.view(np.uint8), sign), field.cost)
 
 
 def match_level(images: PyramidPair, level: int, above: State | None, near_sign: float = 0.0) -> State:
-    """The state of a level, from that of the level above (None: the top): search, propagate, check, band.
+    """State of a level, from that of the level above (None: the top): search, propagate, check, band.
 
-    ``near_sign``: sign of depth that is known beforehand, as of aligned images, which do not tell it; 0: it is not.
+    ``near_sign``: sign of depth, where it is known beforehand (aligned images do not show it); 0 unknown.
     """
     known, rounds = near_sign or (0.0 if above is None else above.near_sign), images.recipe.rounds
     back = None if above is None else above.reverse()
@@ -245,7 +247,7 @@ def match_level(images: PyramidPair, level: int, above: State | None, near_sign:
 
 
 def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limit: float) -> NDArray[np.bool_]:
-    """Usable pixels whose whole displacement is undone by the other map within ``limit`` pixels (4.3.3).
+    """Usable pixels whose displacement the other map inverts to within ``limit`` pixels (4.3.3), bool.
 
     ``own, other``: maps, ``u`` and ``v`` int16.
     """
@@ -268,38 +270,39 @@ def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[
 
 
 def one_way(images: PyramidPair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:
-    """Displacements from the left image to the right one, at a level below that of the state ``above``, by the rounds
-    ``fine_rounds`` at the finest; ``above`` None: the top."""
+    """Displacements from the left image to the right one at a level, from the state ``above`` (None: the top).
+
+    ``fine_rounds``: rounds of propagation at the finest level."""
     up = None if above is None else hand_down(above, images.params)
     rounds = min(images.params.rounds, fine_rounds if level == 0 else images.recipe.rounds[0] + level)
     band = FREE_BAND if above is None else above.band
     a, b = images.left.layers[level], images.right.layers[level]
-    look = Look(level, a, b, up, band, near_sign, rounds, images.params)
+    given = LevelInput(level, a, b, up, band, near_sign, rounds, images.params)
     field = Field(np.empty(a.words.shape, np.int32), np.empty(a.words.shape, np.int32))
     for step in images.params.kept((*images.recipe.every, *(images.recipe.finest if level == 0 and above else ()))):
-        field = step(look, field)
+        field = step(given, field)
     return unpacked(field.shift)
 
 
 def hand_down(state: State, params: HfvmParams) -> Map:
-    """Prediction of the next level: the map, its inconsistent pixels interpolated along their row, else column."""
+    """Prediction of the next finer level: inconsistent pixels are interpolated along rows, then along columns."""
     u, v = (a.astype(np.float32) for a in (state.left.u, state.left.v))
-    # While the sign is unknown, the usual rig's stands.
+    # An unknown sign counts as that of the usual rig.
     sign, filled = state.near_sign or -1.0, np.zeros(u.shape, np.uint8)
     fill_rows(u, v, state.left_ok, params.fill_reach, sign, filled)
-    # A row may hold no match, as at the border of the common view: its columns are filled from other rows.
+    # Rows without any match, as at the border of the common view, are filled along the columns.
     fill_rows(u.T, v.T, (state.left_ok | (filled != 0)).T, params.fill_reach, sign, filled.T)
     # Interpolated values are fractions; a search centre is a whole pixel.
     return Map(*(np.rint(a).astype(np.int16) for a in (u, v)))
 
 
 def textured(layer: Layer, params: HfvmParams) -> NDArray[np.bool_]:
-    """Pixels that tell something: what is black in both images, as space is, agrees everywhere."""
+    """Usable pixels with texture (bool); black ones, as of space, match everywhere."""
     return np.asarray((layer.valid != 0) & (layer.deviation >= params.texture))
 
 
 def sample(images: PyramidPair, state: State) -> Sample:
-    """About :data:`MAX_FIT_MATCHES` evenly strided consistent matches of a level, with fractions of a pixel."""
+    """About :data:`MAX_FIT_MATCHES` evenly spread consistent matches of a level, sub-pixel."""
     a, b = images.left.layers[state.level], images.right.layers[state.level]
     y, x = thinned(state.left_ok & textured(a, images.params), MAX_FIT_MATCHES)
     wanted = np.zeros(state.left_ok.shape, np.uint8)
@@ -309,9 +312,9 @@ def sample(images: PyramidPair, state: State) -> Sample:
 
 
 def with_band(images: PyramidPair, state: State, above: State | None) -> State:
-    """The state with the epipolar band for the next finer level, where there is one and it can be fitted.
+    """The state with the epipolar band for the next finer level, where one can be fitted.
 
-    ``above``: the state whose sign of depth is looked for anew where lines turn out to run the other way.
+    ``above``: state of the level above; if the lines now run the other way, the sign of depth is determined anew.
     """
     if images.params.band == 0 or state.level == 0:
         return state
@@ -320,10 +323,10 @@ def with_band(images: PyramidPair, state: State, above: State | None) -> State:
     if fit is None:
         return state
     f, spread = fit
-    # Where lenses bend the lines, or the fit is poor, the band gives way.
+    # The band is softened where lenses bend the lines, or the fit is poor.
     mu = images.params.band * min(1.0, epipolar.SHARP_SPREAD_PX / max(spread, 1e-9)) ** 2
     known = replace(state, band=Band(epipolar.finer(f), mu))
-    # Found once, by the first level that has a band; finer ones keep it while lines run the same way.
+    # The first level with a band determines the sign; finer levels keep it while lines run the same way.
     if state.near_sign and (above is None or above.upright == known.upright):
         return known
     if known.upright:

@@ -14,11 +14,12 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
-from rille.stages.hfvm.coarse import PriorDisparities, Unlike
+from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import PyramidPair, Recipe
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.prior import PriorDisparities
 from rille.stages.imaging.pyramid import Pyramid
 
 DEFAULT = Recipe(

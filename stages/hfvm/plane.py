@@ -2,13 +2,13 @@
 
 Feature vectors compare upright windows. On ground seen obliquely the disparity changes by half a pixel from row to row,
 and a 13-pixel kernel shears by several pixels: the matcher then finds plateaus instead of a slope. So the images are
-first matched coarsely as they are; where one plane (and with it roll, row offset and toe-in) explains most of those
-matches and distorts windows noticeably, the right image is resampled by its homography and matching starts anew. Only
-matches say how: no calibration is used, and displacements are given in the original images.
+first matched coarsely as they are; if one plane (which includes roll, row offset and toe-in) explains most of those
+matches and distorts windows noticeably, the right image is resampled by its homography and matching starts again. The
+homography comes from matches alone, without calibration; displacements refer to the original images.
 
-Beyond a turn of some 20 degrees or a scale of 1.3 coarse matching finds nothing. There keypoints that carry their own
-orientation and scale (SIFT, Lowe 2004; compared by the square roots of their histograms, Arandjelovic and Zisserman
-2012) give the homography, and each level is searched from there."""
+Beyond a turn of some 20 degrees or a scale of 1.3 coarse matching fails. There keypoints with an orientation and scale
+of their own (SIFT, Lowe 2004; compared by the square roots of their histograms, Arandjelovic and Zisserman 2012) give
+the homography from which each level is searched."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ KERNEL_REACH_PX = 2
 
 
 def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False) -> Matrix | None:
-    """Homography from aligned pixels to right image pixels (level 0), or None where alignment would not help.
+    """Homography from aligned pixels to pixels of the right image (level 0); None if alignment would not help.
 
     ``shapes``: of the left image's levels; ``few``: whether few pixels match.
     """
     fit = fit_points(sample, shapes[level])
-    # 0.6: least share of the coarse matches that the plane must explain; a street's ground has .44 to .55.
-    # 0.5: the same where windows are so sheared that few match, and of these the ground the least.
+    # 0.6: least share of the coarse matches on the plane; a street's ground has .44 to .55.
+    # 0.5: the same where windows are so sheared that few pixels match, least of all on the ground.
     if fit is None or fit[1] < (0.5 if few else 0.6):
         return None
     h = to_level_0(fit[0], level)
@@ -68,7 +68,7 @@ def find(sample: Sample, level: int, shapes: Sequence[Shape], few: bool = False)
 
 
 def refitted(sample: Sample, level: int, shapes: Sequence[Shape], h: Matrix) -> Matrix | None:
-    """Homography of the dominant plane by matches with a right image that ``h`` has aligned; None: too few."""
+    """Homography of the dominant plane, from matches with the right image aligned by ``h``; None if too few."""
     fit = fit_points(sample, shapes[level])
     return None if fit is None else to_original(h, shapes[0]) @ to_level_0(fit[0], level)
 
@@ -77,10 +77,10 @@ def aligned(right: Image, h: Matrix, left: Image) -> Image:
     """The right image resampled to the left one's geometry, with :func:`margin` pixels more on every side."""
     layers: list[Layer] = []
     m, levels = margin(left.shapes[0]), min(len(left.layers), len(right.layers))
-    # Of the right image's levels that whose pixels, which are means, are as large as those aligned: larger ones blur,
-    # smaller ones alias. Blurring is worse (0.2): fine texture is no longer found at 1.4 times the size.
+    # Each aligned level is read from that level of the right image whose pixels, which are means, are of the same size:
+    # larger ones blur, smaller ones alias. Blurring is worse (0.2): at 1.4 times the size fine texture is lost.
     above = round(math.log2(scale(h, left.shapes[0])) - 0.2)
-    # From the top down: masked pixels take their grey from the level above.
+    # From the top down, since masked pixels take their grey value from the level above.
     for n in range(levels - 1, -1, -1):
         source = min(max(n + above, 0), len(right.layers) - 1)
         layer = right.layers[source]
@@ -93,7 +93,7 @@ def aligned(right: Image, h: Matrix, left: Image) -> Image:
 def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> Grey:
     source = _source(h, window, layer.shape)
     grey, mask = layer.read(source)
-    # The edge is repeated for the kernel: of the few pixels of a coarse level none may be lost.
+    # The kernel reads repeated edges, so that no pixel of a coarse level, which has few, is lost.
     grey, mask = np.pad(grey, KERNEL_REACH_PX, mode="edge"), np.pad(mask, KERNEL_REACH_PX)
     image, valid = np.empty(window.shape, np.float32), np.empty(window.shape, np.uint8)
     there = translation(KERNEL_REACH_PX - source.x0, KERNEL_REACH_PX - source.y0)
@@ -122,20 +122,20 @@ def _source(h: Matrix, window: Window, shape: Shape) -> Window:
 
 
 def to_original(h: Matrix, left_shape: Shape) -> Matrix:
-    """Homography to the original right image from aligned pixels that are counted as the left image's are."""
+    """Homography to the original right image from aligned pixels in coordinates of the left image."""
     return h @ translation(-margin(left_shape))
 
 
 @njit(cache=True, nogil=True)
 def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
-    """Displacements (row, col) float32 to where a homography maps the ends of given ones.
+    """Displacements (row, col) float32 whose ends are those of ``u, v``, mapped by the homography ``g``.
 
     ``x0, y0``: first column and row of the left image's window. NaN beyond the horizon.
     """
     out_u, out_v = np.empty(u.shape, np.float32), np.empty(u.shape, np.float32)
     for row in range(u.shape[0]):
         for col in range(u.shape[1]):
-            # In double precision: the difference of two columns must keep their fractions.
+            # In double precision: differences of columns lose digits.
             x, y = np.float64(col + x0), np.float64(row + y0)
             p, q, w = product(g, x + u[row, col], y + v[row, col])
             # Points beyond the horizon would come back mirrored.
@@ -145,8 +145,8 @@ def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
 
 
 def margin(left_shape: tuple[int, ...]) -> int:
-    """Pixels added on every side of the aligned image: whole ones of the sixth level, too."""
-    # A sixteenth of the width is added around the aligned image, for what stands out of the plane.
+    """Pixels added on every side of the aligned image: a multiple of 32, whole pixels down to the sixth level."""
+    # A sixteenth of the width, for things that stand out of the plane.
     return int(np.ceil(left_shape[1] / 16.0 / 32.0)) * 32
 
 
@@ -169,21 +169,21 @@ def fit_points(sample: Sample, shape: Shape) -> tuple[Matrix, float] | None:
     x, y, u, v = sample
     if len(y) < 60:
         return None
-    # In half image sides all eight terms are of like size, so that one weak hold suits them all.
+    # In half image sides all eight terms are of similar size, so that one weak prior suits them all.
     scale = 0.5 * max(shape)
     middle = (0.5 * shape[1] / scale, 0.5 * shape[0] / scale)
     to_unit = np.array([[1 / scale, 0.0, -middle[0]], [0.0, 1 / scale, -middle[1]], [0.0, 0.0, 1.0]])
     p = np.stack([x / scale - middle[0], y / scale - middle[1]])
     d = np.stack([u, v]).astype(np.float64) / scale
-    # A match a pixel of the level off the plane has a quarter of the weight.
+    # A match that lies a pixel of the level off the plane has a quarter of the weight.
     unit, error = _solve(p, d, 1.0 / scale)
     return np.linalg.inv(to_unit) @ unit @ to_unit, float(np.mean(error <= 2.0 / scale))
 
 
 def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray]:
-    """Homography of points (2, n) moved by ``d`` (2, n), robustly, and each point's error.
+    """Robust homography of points (2, n) that move by ``d`` (2, n), and the error of each point.
 
-    ``q = p + d`` with q ~ H p is linear in the eight terms of H - I where H[2, 2] = 1; they are weakly held at zero.
+    ``q = p + d`` with q ~ H p is linear in the eight terms of H - I where H[2, 2] = 1; a weak prior holds them at zero.
     """
     one, nil, q = np.ones_like(p[0]), np.zeros_like(p[0]), p + d
     along = [p[0], p[1], one, nil, nil, nil, -q[0] * p[0], -q[0] * p[1]]
@@ -193,12 +193,12 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
     def weigh(residual: AnyArray) -> AnyArray:
         nonlocal spread
         error = np.hypot(*residual.reshape(2, -1))
-        # The first fit is of all alike; then start as wide as the matches scatter, and narrow onto the dominant plane.
+        # Equal weights at first; then from the scatter of the matches on, narrowing to the dominant plane.
         if math.isinf(spread):
             spread = 1e6  # half image sides: no error is greater
             return np.ones(len(target))
         spread = max(tolerance, min(1.5 * typical(error), 0.7 * spread))
-        # Squared Cauchy weights: other surfaces, off by many pixels, must not drag the plane along.
+        # Squared Cauchy weights: other surfaces, off by many pixels, must not pull the plane.
         return np.tile(cauchy(error, spread) ** 2, 2)
 
     h = irls(terms.T, target, weigh, 1e-6 * len(one) * np.eye(8), rounds=15)
@@ -207,7 +207,7 @@ def _solve(p: AnyArray, d: AnyArray, tolerance: float) -> tuple[Matrix, AnyArray
 
 
 def to_level_0(h: Matrix, level: int) -> Matrix:
-    """Homography of level ``level`` pixels as one of level 0 pixels."""
+    """Homography of pixels of level 0, from that of pixels of ``level``."""
     up = finer(level)
     return np.asarray(up @ h @ np.linalg.inv(up), dtype=np.float64)
 
@@ -220,17 +220,17 @@ def finer(level: int) -> Matrix:
 
 
 def scale(h: Matrix, shape: Shape) -> float:
-    """Pixels of the right image that one in the middle of an aligned image is wide and high, in the geometric mean."""
+    """Size of the aligned image's middle pixel in pixels of the right image, geometric mean of both sides."""
     w = product(h, 0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))[2]
     # The determinant of the derivative of a homography.
     return math.sqrt(abs(float(np.linalg.det(h))) / abs(w) ** 3)
 
 
 def distortion(h: Matrix, shape: tuple[int, int]) -> float:
-    """Greatest element of the derivative's departure from the identity, each taken as the median over an image."""
+    """Largest element of the derivative less the identity, each element the median over the image."""
     y, x = np.meshgrid(np.linspace(0, shape[0] - 1, 5), np.linspace(0, shape[1] - 1, 5), indexing="ij")
     p, q, w = product(h, x, y)
-    # So near the horizon it is no ground but a bad fit, which infinity has refused.
+    # A plane whose horizon comes so near is no ground but a bad fit: infinity has it refused.
     if (w <= 0.1).any():
         return np.inf
     p, q = p / w, q / w
@@ -264,7 +264,7 @@ def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
 
 
 MIN_AGREEING = 15
-"""Keypoints that must agree; in unrelated images and under other suns 6 do."""
+"""Least number of agreeing keypoints; in unrelated images, and under another sun, 6 agree."""
 
 
 def find_turn(left: Image, right: Image) -> Matrix | None:
@@ -274,18 +274,18 @@ def find_turn(left: Image, right: Image) -> Matrix | None:
     first, second = match(a.astype(np.float32), b.astype(np.float32)).T
     if len(first) < MIN_AGREEING:
         return None
-    # What relief does to a keypoint's place on the dominant surface.
+    # Relief moves keypoints off the dominant surface by as much.
     limit = 0.01 * max(right.shapes[levels[1]])
     h, agree = cv2.findHomography(p[first], q[second], cv2.USAC_MAGSAC, limit, maxIters=5000, confidence=0.999)
     # 0.2: share of the unambiguous keypoints that must agree.
     if h is None or agree.sum() < max(MIN_AGREEING, 0.2 * len(first)) or not _upright(h, left.shapes[levels[0]]):
         return None
-    # Images of unlike size are looked at on levels of their own, so each side has its own scale.
+    # Images of unlike size have keypoints of unlike levels.
     return np.asarray(finer(levels[1]) @ h @ np.linalg.inv(finer(levels[0])), dtype=np.float64)
 
 
 def _level(view: Image) -> int:
-    """Finest level whose longer side is at most 1024 pixels, else the coarsest: keypoints are looked for there."""
+    """Level of the keypoints: the finest whose longer side is at most 1024 pixels, else the coarsest."""
     return next((n for n, shape in enumerate(view.shapes) if max(shape) <= 1024), len(view.shapes) - 1)
 
 
@@ -293,7 +293,7 @@ def _keypoints(view: Image, level: int) -> tuple[Floats, Floats, Bytes]:
     """Keypoints of a level: columns and rows, pixels of the level, sizes, and descriptors (:func:`root_sift`)."""
     layer = view.layers[level]
     grey = np.clip(np.rint(layer.grey), 0, 255).astype(np.uint8)
-    # Comparing all keypoints with all takes their number squared.
+    # At most 4000: the time of comparing all with all grows with the square.
     # 0.02: least contrast of a keypoint; half of OpenCV's default, for sand and haze.
     sift = cv2.SIFT.create(nfeatures=4000, contrastThreshold=0.02)
     return root_sift(sift, grey, (layer.valid != 0).astype(np.uint8))

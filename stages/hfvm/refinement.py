@@ -1,14 +1,15 @@
-"""Refinement of displacements, by windows and by a relief of all of them; and their standard deviations.
+"""Refinement of displacements, by windows and by a relief through all of them; and their standard deviations.
 
 **Windows.** Mean-free Lucas-Kanade steps against the right image warped by the disparities remove the perspective
 bias.
 
 Feature vectors compare upright windows; where the two views foreshorten a surface differently their best displacement
-is biased. Warping the right image by the smoothed disparities first makes the windows alike, and what is left is a
-small displacement, solved per window. A pixel keeps the step only if it makes its window fit better.
+is biased. Warping the right image by the smoothed disparities makes the windows alike, and leaves a small displacement,
+solved per window. A pixel keeps the step only if it improves the fit of its window.
 
-Steps are taken in the frame of the aligned right image, where neighbours move alike even between turned views; grey
-values and gradients are those of the spline through the right image itself, which is interpolated only once.
+Steps are computed in the frame of the aligned right image, where neighbours have similar displacements even between
+turned views; grey values and gradients are those of the spline through the right image itself, so that it is
+interpolated only once.
 
 **Relief.** Displacements of all matches at once, piecewise smooth and along epipolar lines.
 
@@ -19,10 +20,10 @@ Here the displacements (u, v) of all matched pixels minimise
 
 with r the difference of the left image and the right one warped by the last step, free of its robust local mean; g the
 warped gradient, both of the cubic spline through the pixels, which keeps detail that a local cubic kernel blurs; w
-falling with r and s with the second difference found, so that neither a wrong pixel nor an edge drags its neighbours
-along. Stiffness starts weak and tolerant of bends: from the first, it would take the errors that windows make beside
-edges for relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.epipolar`); k gives way
-where they do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+falling with r and s with the second difference, so that neither a wrong pixel nor an edge pulls its neighbours.
+Stiffness begins weak and tolerant of bends: at full strength it would keep the errors of windows beside edges as
+relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.epipolar`); k is reduced where matches
+do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 
 **Standard deviations** of the column disparities, of the rows' where epipolar lines run along the columns, come from
 what the matcher knows at each pixel.
@@ -69,12 +70,12 @@ WINDOW_RADIUS_PX = 2
 """Pixels: the windows are 5 x 5; larger ones have less noise, and smooth small relief away."""
 
 MAX_CORRECTION_PX = 1.5
-"""Pixels: a correction beyond this is a jump to something else."""
+"""Pixels: a larger correction is a jump to another match."""
 
 
 class Refined(NamedTuple):
-    """Displacements (row, col) float32, the mean-free residual variance of their windows, squared grey levels (inf:
-    none), and the variance of the column displacement, or the row's, for a unit of variance of the grey levels."""
+    """Displacements (row, col) float32; the mean-free residual variance of their windows, squared grey levels (inf:
+    none); and the variance of the column displacement (or the row's) for grey values of unit variance."""
 
     u: AnyArray
     v: AnyArray
@@ -93,7 +94,7 @@ class SplineImages(NamedTuple):
 def refine(
     images: SplineImages, to_right: Frame, start: Maps, keep: AnyArray, steps: int, upright: bool = False
 ) -> Refined:
-    """Displacements without the perspective bias, in the frame in which they are given.
+    """Displacements without the perspective bias, in the frame of ``start``.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ def refine(
 
 @njit(cache=True, nogil=True)
 def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
-    """Start displacements and residuals where steps led far or away from a fit.
+    """Restore displacements and residuals where the steps led too far, or to a worse fit.
 
     Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
     """
@@ -131,7 +132,7 @@ def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
-    """Means of the kept pixels in a window whose displacement lies within one pixel of the middle's.
+    """Mean displacements of the kept pixels of each window that lie within one pixel of the middle's displacement.
 
     The window reaches ``radius`` pixels, of which each ``stride``-th from its border on takes part. ``u, v``: (row,
     col) float32; ``keep``: bool.
@@ -271,12 +272,11 @@ def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
 def surroundings(rest: AnyArray, deviations: Maps, keep: AnyArray, noise: tuple[float, float]) -> Maps:
     """Correlation of the left image with the warped right one over a wider window, and the residual variance there.
 
-    Both (row, col) float32; correlation 1 and residual 0 where not known. From the residual variance ``rest`` and the
-    local ``deviations`` of the left image and, at its matches, the right one: signals of deviations a and b and
-    correlation r differ by a^2 + b^2 - 2 r a b. Noise that found noise to match, in a shadow or the sky, gives itself
-    away. ``noise``: variances that the left and the right image's noise had before they were denoised. What the noise
-    explains of a^2, b^2 and of the difference is then left out, if that makes them more alike and the left image shows
-    more than noise.
+    Both (row, col) float32; correlation 1 and residual 0 where unknown. They follow from the residual variance ``rest``
+    and the local ``deviations`` of the left image and of the right one at the matches: signals of deviations a and b
+    and correlation r differ by a^2 + b^2 - 2 r a b. Matches of noise with noise, in a shadow or the sky, correlate
+    little. ``noise``: variances of the noise of both images before they were denoised; these are subtracted from a^2,
+    b^2 and the difference, if that raises the correlation and the left image shows more than noise.
     """
     known = keep & (rest < np.inf)
     nil = np.float32(0.0)
@@ -355,14 +355,14 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
 
 
 def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
-    """Planes (4, row, col): weight of each pixel, gradient (x, y) of the warped right image, difference of the images
-    free of its local mean; weight 0 where a pixel does not take part."""
+    """Planes (4, row, col): weight of each pixel (0: unused), gradient (x, y) of the warped right image, and difference
+    of the images less its local mean."""
     planes = _warped(images, u, v, keep)
     known, _, _, rest = planes
     mean, weight = np.zeros_like(rest), known
-    # The first mean has equal weights; the next ones give pixels across an edge little weight. One round is too few.
+    # The first mean has equal weights; the later ones give pixels across an edge little weight.
     for _ in range(3):
-        # Windows with less than a tenth of a pixel's weight have no pixel that takes part.
+        # A window with less weight than a tenth of a pixel has no pixel in use.
         # 9 pixels: window of the local mean; brightness varies more slowly.
         mean = window_sum(weight * rest, 9) / np.maximum(window_sum(weight, 9), 0.1)
         # 10.0 grey levels: residual that halves a pixel's weight, well above camera noise.
@@ -373,17 +373,16 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
 
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
-    """Epipolar lines (row, col, 3) fitted to the matches, and how far to trust them, 0..1; 0 where not determined, or
-    bent."""
+    """Epipolar lines (row, col, 3) fitted to the matches, and trust in them, 0..1: 0 if undetermined or bent."""
     y, x = thinned(keep, 4000)
     fit = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
     if fit is None:
         return np.zeros((*u.shape, 3), np.float32), 0.0
     lines = epipolar.lines(fit[0], u.shape)
-    # Clipped, lest a patch of wrong matches passes for a bend.
+    # Clipped, so that a patch of wrong matches does not count as a bend.
     off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
     off = np.where(keep, off, np.float32(0))
-    # 65 pixels: side of a neighbourhood whose matches lie off their lines to one side where lenses bend the lines.
+    # 65 pixels: side of a neighbourhood; where lenses bend the lines its matches lie off them to one side.
     bent = (window_sum32(off, 65) / np.maximum(window_count(keep, 65), 1))[y, x]
     # 0.05 pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square.
     trust = min(1.0, (0.05 / max(fit[1], 1e-9)) ** 2)
@@ -392,7 +391,7 @@ def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int
 
 
 def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
-    """Kept displacements moved to their lines as far as those are trusted; the others as they are."""
+    """Displacements with the kept ones moved towards their lines, by the share ``trust`` of the distance."""
     off = lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
     e = np.where(keep, np.float32(trust) * off, np.float32(0))
     return u - e * lines[..., 0], v - e * lines[..., 1]
@@ -412,7 +411,7 @@ def _stiffness(u: AnyArray, v: AnyArray, keep: AnyArray, bend: np.float32, stiff
 
 @njit(cache=True, nogil=True)
 def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def]
-    """What the sweeps need of each pixel's normal equations (m n; n o) (u, v) = (p, q) + what its neighbours want.
+    """Inverted normal equations of each pixel, for the sweeps: (m n; n o) (u, v) = (p, q) + terms of its neighbours.
 
     ``out`` (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
     :func:`_grey`; ``holds``: lines whose distance is in grey levels.
@@ -475,7 +474,7 @@ def _sweep(normal, across, down, u, v):  # type: ignore[no-untyped-def]
 
 
 BLANK_STD_PX = 0.2
-"""Standard deviation (pixels) that is added to matches of textureless regions; the parts below do not explain it."""
+"""Standard deviation (pixels) added to matches of textureless regions, which the parts below do not contain."""
 
 # Factors of the parts. For each of several floors ``benchmarks/disparity_std.py --fit`` found the others on four mockup
 # pairs (seeds 1, 2 and 6, and seed 7 with noise of 4 grey levels); the floor, which no simulated lens shows, is the one

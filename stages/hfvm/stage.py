@@ -4,12 +4,12 @@ Nothing is rectified and no calibration is used. ``match`` works on plain arrays
 the method on one page, in the order of the paper, and each preset as a list of steps (their parameters:
 :class:`~rille.stages.hfvm.params.HfvmParams`).
 
-- ``image``: grey values, masks and features of windows of an image; ``coarse``: known disparities, brightness, and the
-  levels down to 1; ``plane``: alignment by a homography.
+- ``image``: grey values, masks and features of windows of an image; ``coarse``: the levels down to 1, with
+  ``brightness``, ``prior`` disparities, alignment by a ``plane``, and focus.
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
 - ``finest``: the finest level, window by window; ``refinement`` of displacements, and their standard deviations;
   ``textureless``: planes.
-- ``tile_stage``, ``join_stage``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to
+- ``tiles``: large pairs as tasks. ``paper``: section 4.3 to the letter. ``given``: whether to
   believe another program's disparities.
 """
 
@@ -25,9 +25,10 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper
-from rille.stages.hfvm.coarse import PriorDisparities, Unlike, known_beforehand
+from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.matcher import WHOLE, How
 from rille.stages.hfvm.params import HfvmParams
+from rille.stages.hfvm.prior import PriorDisparities, known_beforehand
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -83,7 +84,7 @@ def match(
     params : matcher's parameters; None: preset ``default``.
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
     prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
-        :mod:`rille.stages.hfvm.coarse`); None: nothing is known.
+        :mod:`rille.stages.hfvm.prior`); None: nothing is known.
     how : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
         Presets ``accurate`` and ``paper`` are matched whole.
 

@@ -1,6 +1,6 @@
-"""Matches of textureless regions, such as walls, by planes on which wide windows of a whole region agree.
+"""Matches of textureless regions, such as walls, by a plane on which wide windows of the region agree.
 
-Where an image shows next to nothing, a pixel's own match is chance. Distances of features, summed over a wide window,
+Where an image shows hardly any texture, a single pixel matches by chance. Feature distances summed over a wide window
 are least at the right displacement more often than at any other. So at level 1, in each large region without matches
 and texture:
 
@@ -8,16 +8,16 @@ and texture:
    displacements that were matched and of farther ones, and a fraction of a pixel by the sums on both sides;
 2. a plane is fitted robustly: the displacement along the line is a linear function of column and row. The more a
    window's sum exceeds that of its best displacement for all others, the more it counts;
-3. if clearly more windows agree with the plane than would by chance, pixels are matched at its displacement whose
-   windows speak no more against it than those that agree do: their sum there exceeds their least by as little. Their
-   standard deviation is that of the agreeing windows. The rest of the region is filled with the plane.
+3. if clearly more windows agree with the plane than would by chance, those pixels are matched at its displacement
+   whose windows contradict it no more than the agreeing ones do: their sum there exceeds their least sum by as little.
+   Their standard deviation is that of the agreeing windows. The rest of the region is filled with the plane.
 
-A window has a vote if most displacements leave it inside the right image, and if its match there is mutual: of all
-windows that any displacement leads to the same right pixel, one with the same displacement is the most alike. What the
-right image hides, such as the strip beside a near thing, has no match, and takes what belongs to another. Windows to
-which two displacements are equal (a black or an overexposed sky) have no vote either. A window whose best displacement
-is one of the last two on either side does not agree. Nearly half of a region must have a
-vote: what lies between a near thing and the image's border may be hidden in the right image.
+A window has a vote if most displacements leave it inside the right image, and if its match is mutual: of all windows
+that any displacement leads to the same right pixel, one with the same displacement is the most similar. Ground that is
+hidden in the right image, such as the strip beside a near thing, has no match there, and takes one that belongs to
+other ground. Windows with two equally good displacements (a black or an overexposed sky) have no vote either. A window
+whose best displacement is one of the last two on either side does not agree. Nearly half of a region must have a vote:
+ground between a near thing and the image's border may be hidden in the right image.
 
 Chosen with motorcycle, Baby1, Cloth1, Lampshade1 and Midd1, as they are and with the right image degraded: on the wall
 of Midd1, three eighths of the image, wide windows are right for four in ten pixels, matches for two. That matches must
@@ -50,11 +50,11 @@ WINDOW_SIDE_PX = 2 * WINDOW_RADIUS_PX + 1
 """Side of the window, pixels."""
 
 MIN_DISTINCT_STEPS = 2
-"""Steps from the best one to those that it must be distinct from."""
+"""Steps beside the best one that it need not be distinct from."""
 
 
 class Region(NamedTuple):
-    """A region, by the window that holds it, and what its pixels are compared with.
+    """A region: its window of the left image, and the right image that it is compared with.
 
     ``left``: features (row, col) of the window, whose first column and row are ``x0, y0``; ``inside``: bool, which
     pixels belong to the region; ``lines``: see :func:`rille.stages.hfvm.epipolar.lines`; ``right, valid``: features and
@@ -76,12 +76,12 @@ class Region(NamedTuple):
 
 
 class Searched(NamedTuple):
-    """What a search tells of each pixel of a region, (row, col).
+    """Result of the search for each pixel of a region, (row, col).
 
-    ``tried``: int32, steps that leave all of its window inside the right image. ``best, least``: float32, the step with
-    the least sum of distances over the window, moved by a fraction, and that sum. ``distinct``: float32, by how much
-    the sum of each step more than :data:`MIN_DISTINCT_STEPS` from the best one exceeds it, 0 where there is none.
-    ``mutual``: bool, whether no step so far from it leads a window more alike to the same pixel.
+    ``tried``: int32, number of steps that leave its whole window inside the right image. ``best, least``: float32, the
+    step with the least sum of distances over the window, sub-pixel, and that sum. ``distinct``: float32, by how much
+    all sums more than :data:`MIN_DISTINCT_STEPS` from the best step exceed the least, 0 if there is none. ``mutual``:
+    bool, whether no step so far from the best one leads a more similar window to the same right pixel.
     """
 
     tried: AnyArray
@@ -91,10 +91,10 @@ class Searched(NamedTuple):
     mutual: NDArray[np.bool_]
 
 
-class SoFar(NamedTuple):
-    """Of each pixel: how many steps were tried; the best one and its sum; the sums a step before and after it; the
-    least one far from it. And of each right pixel the least mean distance of the windows led to it, and the step that
-    did."""
+class SearchState(NamedTuple):
+    """State of a search, updated step by step. Of each pixel: the number of steps tried; the best step and its sum; the
+    sums one step before and after it; the least sum far from it. Of each right pixel: the least mean distance of the
+    windows led to it, and the step of that window."""
 
     tried: AnyArray
     best: AnyArray
@@ -107,27 +107,28 @@ class SoFar(NamedTuple):
 
 
 def search(region: Region, steps: AnyArray) -> Searched:
-    """The best step along the line of each pixel of a region, of ``steps``: (n,) float32 pixels, ascending by 1."""
+    """The best of ``steps`` ((n,) float32 pixels, ascending by 1) along the epipolar line of each pixel of a region."""
     shape = region.inside.shape
     tried, (best, least, distinct) = np.zeros(shape, np.int32), np.zeros((3, *shape), np.float32)
     found = Searched(tried, best, least, distinct, np.zeros(shape, bool))
     here, there = np.full((5, *shape), np.inf, np.float32), np.full((2, *region.right.shape), np.inf, np.float32)
-    so_far = SoFar(tried, *here, *there)
-    # Sums of the steps before, and the least of all that are more than MIN_DISTINCT_STEPS behind.
+    state = SearchState(tried, *here, *there)
+    # Sums of the last steps, and the least sum of those more than MIN_DISTINCT_STEPS behind.
     last, passed, size = deque[AnyArray](), np.full(shape, np.inf, np.float32), region.size
     for step in steps:
         total = _sums(region, np.full(shape, step))
         if len(last) > MIN_DISTINCT_STEPS:
             np.minimum(passed, last.popleft(), out=passed)
-        _look(region, step, (total, last[-1] if last else passed, passed, size), so_far)
+        _update(region, step, (total, last[-1] if last else passed, passed, size), state)
         last.append(total)
-    _judge(region, so_far, found)
+    _judge(region, state, found)
     return found
 
 
 def _sums(region: Region, at: AnyArray) -> AnyArray:
-    """Sum (row, col) of the distances of a region's pixels in each window, float32; infinite outside of the region and
-    where one of them leads out of the right image. ``at``: the step of each pixel along its line, float32."""
+    """Sum (row, col) of the distances of a region's pixels over the window of each pixel, float32; infinite outside of
+    the region, and where a pixel of the window is led out of the right image. ``at``: the step of each pixel along its
+    line, float32."""
     cost, outside = np.zeros(at.shape, np.float32), np.zeros(at.shape, np.uint8)
     _distances(region, at, cost, outside)
     total = window_sum32(cost, WINDOW_SIDE_PX)
@@ -137,7 +138,7 @@ def _sums(region: Region, at: AnyArray) -> AnyArray:
 
 @njit(cache=True, nogil=True)
 def _end(region, y, x, step):  # type: ignore[no-untyped-def]
-    """Row and column of the right image that its step along its line leads a pixel of the window to."""
+    """Row and column of the right image to which a step along its line leads a pixel."""
     line = region.lines[y, x]
     u, v = epipolar.on_line((line[0], line[1], line[2]), step)
     return np.int64(np.rint(y + region.y0 + v)), np.int64(np.rint(x + region.x0 + u))
@@ -158,67 +159,67 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _look(region, step, sums, so_far):  # type: ignore[no-untyped-def]
-    """Update ``so_far`` with the sums of one more step; ``sums``: those of the step before, the least of those far
+def _update(region, step, sums, state):  # type: ignore[no-untyped-def]
+    """Update ``state`` with the sums of one more step; ``sums``: those of the step before, the least of those far
     behind, and the windows' sizes besides."""
     total, previous, passed, size = sums
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
-            since = step - so_far.best[y, x]
-            if total[y, x] < so_far.least[y, x]:
-                so_far.best[y, x], so_far.least[y, x] = step, total[y, x]
-                so_far.before[y, x], so_far.after[y, x], so_far.rival[y, x] = previous[y, x], np.inf, passed[y, x]
+            since = step - state.best[y, x]
+            if total[y, x] < state.least[y, x]:
+                state.best[y, x], state.least[y, x] = step, total[y, x]
+                state.before[y, x], state.after[y, x], state.rival[y, x] = previous[y, x], np.inf, passed[y, x]
             elif since == 1:
-                so_far.after[y, x] = total[y, x]
+                state.after[y, x] = total[y, x]
             elif since > MIN_DISTINCT_STEPS:
-                so_far.rival[y, x] = min(so_far.rival[y, x], total[y, x])
+                state.rival[y, x] = min(state.rival[y, x], total[y, x])
             if total[y, x] < np.inf:
-                so_far.tried[y, x] += 1
+                state.tried[y, x] += 1
                 j, i = _end(region, y, x, step)
-                if total[y, x] / size[y, x] < so_far.claim[j, i]:
-                    so_far.claim[j, i], so_far.claimant[j, i] = total[y, x] / size[y, x], step
+                if total[y, x] / size[y, x] < state.claim[j, i]:
+                    state.claim[j, i], state.claimant[j, i] = total[y, x] / size[y, x], step
 
 
 @njit(cache=True, nogil=True)
-def _judge(region, so_far, found):  # type: ignore[no-untyped-def]
+def _judge(region, state, found):  # type: ignore[no-untyped-def]
     """Write what all steps together tell. Sums of absolute differences are more like two lines than like a parabola."""
     for y in range(found.mutual.shape[0]):
         for x in range(found.mutual.shape[1]):
-            step, least = so_far.best[y, x], so_far.least[y, x]
-            before, after = so_far.before[y, x], so_far.after[y, x]
+            step, least = state.best[y, x], state.least[y, x]
+            before, after = state.before[y, x], state.after[y, x]
             found.best[y, x], found.least[y, x] = step, least
             if least < np.inf:
                 j, i = _end(region, y, x, step)
-                found.mutual[y, x] = abs(so_far.claimant[j, i] - step) <= MIN_DISTINCT_STEPS
+                found.mutual[y, x] = abs(state.claimant[j, i] - step) <= MIN_DISTINCT_STEPS
                 if max(before, after) < np.inf:  # no end of the steps
                     found.best[y, x] += linear(before, least, after)
-                if so_far.rival[y, x] < np.inf:
-                    found.distinct[y, x] = so_far.rival[y, x] - least
+                if state.rival[y, x] < np.inf:
+                    found.distinct[y, x] = state.rival[y, x] - least
 
 
 REGION_LEVEL = 1
-"""Halving once halves noise, and a quarter of the pixels is to be searched."""
+"""One halving halves the noise and leaves a quarter of the pixels to search."""
 
 
 MIN_REGION_PX = 6 * WINDOW_SIDE_PX * WINDOW_SIDE_PX
 """Least size of a region, and of the part of it that has a vote, pixels of the level."""
 
 MAX_VOTE_DISTANCE_PX = 1.25
-"""Pixels of the level: the plane is that with the most votes nearer than this; with twice of it tilted planes were
-chosen. No whole number, as displacements are."""
+"""Pixels of the level: the plane with the most votes within this distance is chosen; with twice as much, tilted planes
+were. No whole number, so that no integer displacement lies on the limit."""
 
 MAX_AGREE_DISTANCE_PX = 2.5
-"""Pixels of the level: windows agree with the plane that are nearer than this. No whole number, either."""
+"""Pixels of the level: windows within this distance agree with the plane. No whole number, either."""
 
 MAX_SLOPE = MAX_VOTE_DISTANCE_PX / WINDOW_RADIUS_PX
-"""Displacements a pixel: across the windows of a steeper plane no displacement is right."""
+"""Displacement a pixel: on a steeper plane no single displacement is right for a whole window."""
 
 
 class Planes(NamedTuple):
     """Planes of textureless regions.
 
-    ``region``: (row, col) of level 1, int8, number of the region from 1 on, negative where it is not matched but filled
-    alone; 0 elsewhere. ``terms``: of each region, pixels of level 0: terms (1, x, y) of the displacement along the
+    ``region``: (row, col) of level 1, int8, number of the region from 1 on, negative where a pixel is filled but not
+    matched; 0 elsewhere. ``terms``: of each region, pixels of level 0: terms (1, x, y) of the displacement along the
     lines of ``f``, and its standard deviation.
     """
 
@@ -227,7 +228,8 @@ class Planes(NamedTuple):
     f: epipolar.Matrix
 
     def cut(self, window: Window) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-        """Region, as above, of the pixels of a window of level 0; columns, rows, standard deviations of its plane."""
+        """Region, as above, of the pixels of a window of level 0; column and row displacements of its plane, and their
+        standard deviations."""
         twice = self.region[window.parent().slices].repeat(2, axis=0).repeat(2, axis=1)
         rows, cols = window.shape
         region = twice[window.y0 % 2 :, window.x0 % 2 :][:rows, :cols]
@@ -255,7 +257,7 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
     up = plane.finer(REGION_LEVEL)
     coarse = up.T @ f @ up
     steps = _steps(matches, f, near_sign)
-    # Of the pixels below none is matched.
+    # A pixel of the level counts as unmatched if none of its four pixels is matched.
     unmatched = np.ones((2 * left.shape[0], 2 * left.shape[1]), bool)
     np.not_equal(matches["validity"], 0, out=unmatched[whole(matches["validity"].shape).slices])
     weak = (unmatched[::2, ::2] & unmatched[::2, 1::2]) & (unmatched[1::2, ::2] & unmatched[1::2, 1::2])
@@ -266,7 +268,7 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
         words = np.ascontiguousarray(left.words[window.slices])
         region = Region(words, inside, lines, right.words, right.valid, x0, y0)
         found = search(region, steps)
-        # Half of the displacements leave a window with a vote inside the right image.
+        # A window has a vote if at least half of the displacements leave it inside the right image.
         usable = (found.tried >= 0.5 * len(steps)) & (found.distinct > 0)
         y, x = np.nonzero(usable & found.mutual)
         # 0.45: share of a region's pixels that must have a vote. The wall of Midd1 has .47 and more in all degradations
@@ -278,26 +280,25 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
         g, error = _fit(x + x0, y + y0, step, votes)
         rows, cols = np.indices(inside.shape)
         on_plane = (g[0] + g[1] * (cols + x0) + g[2] * (rows + y0)).astype(np.float32)
-        # By how much a pixel's distance, mean of its window, exceeds there that of the window's least sum.
+        # By how much the mean distance of a window on the plane exceeds its least one.
         more = np.full(inside.shape, np.inf)
         more[usable] = (_sums(region, on_plane)[usable] - found.least[usable]) / region.size[usable]
         inner = (steps[1] + 0.5 < step) & (step < steps[-2] - 0.5)
         agree = (error <= MAX_AGREE_DISTANCE_PX) & inner & np.isfinite(more[y, x])
         if _sure(agree, votes, found.tried[y, x]):
             terms.append(_at_level_0(g, error[agree]))
-            # 0.95: share of the agreeing windows that speak no more against the plane than a window may whose pixel is
-            # matched.
+            # 0.95: share of the agreeing windows that contradict the plane no more than a matched pixel's window may.
             alike = more <= np.quantile(more[y[agree], x[agree]], 0.95)
-            # What has another match of its own is not of this plane.
+            # Pixels with another match of their own are not on this plane.
             label[window.slices][inside & ~(usable & found.mutual)] = -len(terms)
             label[window.slices][usable & alike] = len(terms)
     return Planes(label, terms, f)
 
 
 def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
-    """Whether clearly more windows agree than would by chance of the steps ``tried`` in each."""
+    """Whether clearly more windows agree than would by chance, with so many steps ``tried`` in each."""
     chance = np.average(2 * MAX_AGREE_DISTANCE_PX / tried, weights=votes)
-    # Windows that do not overlap and are equally distinct would have to be as many to tell as much.
+    # Effective number of windows: as many independent and equally distinct ones would have the same weight.
     windows = votes.sum() ** 2 / np.sum(votes**2) / WINDOW_SIDE_PX**2
     spread = np.sqrt(chance * (1 - chance) / windows)
     # 6.0: standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of
@@ -315,26 +316,26 @@ def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:
 
 
 def _steps(matches: Mapping[str, AnyArray], f: epipolar.Matrix, near_sign: float) -> AnyArray:
-    """Displacements along the lines that are tried, pixels of the level; ``near_sign``: of nearer ones, 0 unknown."""
+    """Displacements along the lines to be tried, pixels of the level; ``near_sign``: sign of nearer ones, 0 unknown."""
     y, x = thinned(matches["validity"] == 0, MAX_FIT_MATCHES)
     a, b, _ = epipolar.lines_at(f, x, y)
-    # How far along their lines matches lead: what ``epipolar.on_line`` undoes.
+    # Distance of the matches along their lines: the inverse of ``epipolar.on_line``.
     along = b * matches["u"][y, x] - a * matches["v"][y, x]
     low, high = np.quantile(along, (0.005, 0.995)) * 0.5**REGION_LEVEL
-    # Half of the range beyond its far end, and some pixels: a wall is often farther than all else.
+    # Half of the range, and some pixels, beyond its far end: a wall is often farther than everything else.
     beyond = 0.5 * (high - low) + 4
-    # Those at the ends do not count.
+    # The outermost steps do not count as agreeing.
     low, high = low - (2 if near_sign < 0 else beyond), high + (2 if near_sign > 0 else beyond)
     return np.arange(np.floor(low), np.ceil(high) + 1, dtype=np.float32)
 
 
 def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_]]]:
-    """Windows of the large regions that hang together, and which of their pixels belong to them; the largest first."""
-    # What hangs together by a pixel or two is not one region.
+    """Windows of the large connected regions, and their pixels in it; the largest first."""
+    # Opening parts regions that one or two pixels connect.
     opened = cv2.morphologyEx(weak.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, number, about, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     sizes = about[1:, cv2.CC_STAT_AREA]
-    # Their numbers fit a byte with a sign.
+    # 127: region numbers are int8.
     for n in np.argsort(-sizes, kind="stable")[:127]:
         if sizes[n] < MIN_REGION_PX:
             return
@@ -344,7 +345,7 @@ def _regions(weak: NDArray[np.bool_]) -> Iterator[tuple[Window, NDArray[np.bool_
 
 
 def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Terms (1, x, y) of the plane that steps with the most ``votes`` agree with, and how far each step is from it.
+    """Terms (1, x, y) of the plane with the most ``votes``, and the distance of each step from it.
 
     Random sample consensus with a fixed seed, then least squares with the weights of Cauchy squared. Votes are whole
     numbers, so that their sums are exact.
@@ -355,9 +356,9 @@ def _fit(x: AnyArray, y: AnyArray, step: AnyArray, votes: AnyArray) -> tuple[Any
     t, d, weight = np.ascontiguousarray(terms[:, sample]), step[sample], votes[sample]
     # Of 500 planes 32 are right where four in ten windows are.
     three = rng.choice(len(sample), (500, 3), p=weight / weight.sum())
-    # The hold gives a plane, which has few votes, to three windows on a line, and to one that was drawn twice.
+    # The prior keeps the system regular where three windows lie on a line, or one was drawn twice.
     planes = np.linalg.solve(t.T[three] + 1e-6 * np.eye(3), d[three][..., None])[..., 0]
-    # Should all be steep, the flat one is left.
+    # The flat plane stays if all others are too steep.
     planes = np.vstack([[np.median(d), 0.0, 0.0], planes[(np.abs(planes[:, 1:]) <= MAX_SLOPE).all(axis=1)]])
     near = np.abs(sum(g[:, None] * term for g, term in zip(planes.T, t, strict=True)) - d) <= MAX_VOTE_DISTANCE_PX
     g = planes[np.argmax(near @ weight)]

@@ -24,7 +24,7 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
 
     The gain is a power of two that leaves the samples of these images half of the range, for others may be brighter.
     """
-    deep = [image for image in images if np.issubdtype(image.dtype, np.uint16) and _shows(image)]
+    deep = _deep(images)
     if not deep:
         return None
     dark, bright = (
@@ -40,6 +40,19 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     return (max((dark + bright) // 2 - WHITE // (2 * gain), 0), gain) if gain > 1 else None
 
 
+def levels_of_sides(left: Iterable[AnyArray], right: Iterable[AnyArray]) -> tuple[Levels | None, Levels | None]:
+    """Levels of the left and of the right images: the same, unless one camera fills more of its 16 bits by two or more.
+
+    One driver leaves 12 bits as they are, and another one shifts them: by one rule one side would keep 16 grey values.
+    """
+    sides = _deep(left), _deep(right)
+    tops = [max((float(np.percentile(image, OUTLYING[1])) for image in side), default=0.0) for side in sides]
+    if min(tops) > 0 and max(tops) >= 4 * min(tops):
+        return levels_of(sides[0]), levels_of(sides[1])
+    both = levels_of([*sides[0], *sides[1]])
+    return both, both
+
+
 def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
     """A uint16 image with its samples spread; any other one as it is."""
     if levels is None or not np.issubdtype(image.dtype, np.uint16):
@@ -48,9 +61,12 @@ def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
     return np.clip((image.astype(np.int64) - black) * gain, 0, WHITE).astype(np.uint16)
 
 
-def words(levels: Levels) -> str:
-    """What is done to the images."""
-    return "16-bit samples use a small part of their range: (sample - {}) x {} is taken of all images".format(*levels)
+def words(sides: tuple[Levels | None, Levels | None]) -> list[str]:
+    """What is done to the left and to the right images, a line each, or one for both."""
+    named = {"all": sides[0]} if sides[0] == sides[1] else dict(zip(("left", "right"), sides, strict=True))
+    spread_ones = [(name, *levels) for name, levels in named.items() if levels is not None]
+    text = "16-bit samples use a small part of their range: (sample - {}) x {} is taken of {} images"
+    return [text.format(black, gain, name) for name, black, gain in spread_ones]
 
 
 def swapped(image: AnyArray) -> bool:
@@ -60,6 +76,10 @@ def swapped(image: AnyArray) -> bool:
     rough = [float(np.abs(np.diff(a, axis=1)).mean() / a.std()) for a in map(np.float64, (image, image.byteswap()))]
     # Mean difference of neighbouring samples in their standard deviations: of noise 1.1, of images 0.1 to 0.3.
     return rough[0] > 0.5 > 2 * rough[1]
+
+
+def _deep(images: Iterable[AnyArray]) -> list[AnyArray]:
+    return [image for image in images if np.issubdtype(image.dtype, np.uint16) and _shows(image)]
 
 
 def _shows(image: AnyArray) -> bool:

@@ -133,33 +133,19 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
     return [list(range(a, b + 1)) for a, b in zip(basic, ends, strict=True) if b > a]
 
 
-def _warnings(
-    steps: Sequence[Step], basic: Sequence[int], overlap: Sequence[float | None], params: KeyframesParams
-) -> list[str]:
-    """Shortcomings of the choice of ``basic`` pairs; ``overlap`` of each with the one before."""
-    lines = []
-    blind = [k for k, step in enumerate(steps) if not step.overlaps]
-    if blind:
-        lines.append(
-            f"{len(blind)} of {len(steps)} steps between frames have too few coarse matches (at least"
-            f" {min(steps[k].match_rate for k in blind):.0%}), first after the frame at position {blind[0]}: the"
-            " overlap there is not known, and the frames are tracked on a poor prediction"
-        )
-    least, at = min(((v, k) for k, v in enumerate(overlap) if v is not None), default=(1.0, 0))
+def _warnings(overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
+    """A line if a basic pair has less ``overlap`` with the one before than is wanted."""
+    least = min((share for share in overlap if share is not None), default=1.0)
+    stride = params.rule == "stride"
     # 0.4: overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image.
-    wanted = params.overlap if params.rule == "overlap" else 0.4
-    if least < wanted:
-        lines.append(
-            f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted: "
-            + (
-                "set keyframes.stride lower"
-                if params.rule == "stride"
-                else "the camera moves that far in one frame"
-                if basic[at] - basic[at - 1] == 1
-                else f"the frames between positions {basic[at - 1]} and {basic[at]} may not be basic pairs"
-            )
-        )
-    return lines
+    wanted = 0.4 if stride else params.overlap
+    if least >= wanted:
+        return []
+    cause = "the camera moves that far in one frame, or frames between may not be basic pairs"
+    return [
+        f"successive basic pairs overlap by as little as {least:.0%}, {wanted:.0%} are wanted: "
+        f"{'set keyframes.stride lower' if stride else cause}"
+    ]
 
 
 @stage("keyframes", version=3)
@@ -187,6 +173,6 @@ def keyframes_stage(
         "why": ["first frame", *why],
         "displacement": [step.displacement for step in moves],
         "match_rate": [step.match_rate for step in moves],
-        "warnings": _warnings(moves, basic, overlap, params),
+        "warnings": _warnings(overlap, params),
     }
     return Bundle({}, meta)

@@ -196,7 +196,7 @@ def test_runs(place: Place) -> None:
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_knows_commands_and_options(shell: str) -> None:
     script = app.generate_completion(shell=shell)
-    assert {"reconstruct", "compare-dem", "prior-disparity"} <= set(re.findall(r"[a-z]+(?:-[a-z]+)*", script))
+    assert {"reconstruct", "compare-dem", "memory-limit"} <= set(re.findall(r"[a-z]+(?:-[a-z]+)*", script))
 
 
 def test_timing(place: Place) -> None:

@@ -31,7 +31,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.index import TABLE, Index
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.engine.store.zarr_group import codec
-from rille.pipeline.export.read_dem import read_disparity
+from rille.pipeline.export.read_dem import read_raster
 from rille.pipeline.flow import config
 from rille.stages.core.errors import RilleError
 
@@ -94,8 +94,8 @@ def image(path: Path) -> None:
         files.read_grey(path)
 
 
-def disparity(path: Path) -> None:
-    read_disparity(path, (12, 16))
+def raster(path: Path) -> None:
+    read_raster(path)
 
 
 def kitti(path: Path) -> None:
@@ -150,7 +150,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "times": times,
     "config": configuration,
     "image": image,
-    "disparity": disparity,
+    "raster": raster,
     "kitti": kitti,
     "euroc": euroc,
     "packed": packed,

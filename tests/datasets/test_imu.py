@@ -227,6 +227,7 @@ def test_columns_by_order_and_by_name(tmp_path):
         ((0, 0, 0, 9.8, 0, 0, 0), "RIL-187"),
         ((0, 0, 0, 0, 0, 0, 1), "RIL-188"),
         ((0, 0, 0, 0, 0, 0, 0.02), "RIL-188"),  # gravity was taken off
+        ((0, 0, 0, 0, 0, 0, 1000), "RIL-188"),  # of thousandths of g
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, row, code):
@@ -247,7 +248,7 @@ def test_a_value_beyond_any_sensor_is_refused_with_its_line(tmp_path, column, va
 @pytest.mark.parametrize(
     "names",
     [
-        "time,acc_x,acc_y,acc_z,gx,gy,gz",
+        "time,acc_x,acc_y,acc_z,u,v,w",
         "time,u,v,w,gyro_x,gyro_y,gyro_z",
         "time,ang_acc_x,ang_acc_y,ang_acc_z,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z",
     ],
@@ -293,10 +294,28 @@ def test_names_of_one_sensor_in_the_usual_order_are_enough(tmp_path):
         assert found.forces[0].tolist() == [0, 0, 9.81]
 
 
+@pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        ("t,ax,ay,az,gx,gy,gz", (0, 4, 5, 6, 1, 2, 3)),
+        (",time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z", (7, 0, 1, 2, 3, 4, 5, 6)),
+        ("gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z,timestamp [s]", (1, 2, 3, 4, 5, 6, 0)),
+    ],
+    ids=["accelerations first", "a column of numbers before", "times last"],
+)
+def test_columns_in_any_order_are_those_of_their_names(tmp_path, names, order):
+    rows = [(t, 0.1, 0.2, 0.3, 1, 2, 9.5, 7) for t in (0.5, 0.6)]
+    found = read_imu(record_file(tmp_path, names, [[row[k] for k in order] for row in rows]))
+    assert found.times.tolist() == [0.5, 0.6]
+    assert found.rates[0].tolist() == [0.1, 0.2, 0.3]
+    assert found.forces[0].tolist() == [1, 2, 9.5]
+
+
 def test_accelerations_in_multiples_of_gravity_are_converted_where_the_names_say_so(tmp_path):
     names = "t," + ",".join(f"gyro_{a}_mrad" for a in "xyz") + "," + ",".join(f"acc_{a} [g]" for a in "xyz")
-    with raises("RIL-995", "gyro_x_mrad"):
-        read_imu(record_file(tmp_path, names, [(t, 0, 0, 0, 0, 0, 1) for t in (0.0, 0.1)]))
+    read_imu(record_file(tmp_path, names, [(t, 0, 0, 0, 0, 0, 1) for t in (0.0, 0.1)]))
+    with raises("RIL-995", "gyro_x_mm"):
+        read_imu(record_file(tmp_path, names.replace("mrad", "mm"), [(t, 0, 0, 0, 0, 0, 1) for t in (0.0, 0.1)]))
     found = read_imu(
         record_file(tmp_path, names.replace("_mrad", "_deg_s"), [(t, 90, 0, 0, 0, 0, 1) for t in (0.0, 0.1)])
     )

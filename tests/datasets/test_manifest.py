@@ -507,6 +507,13 @@ def test_unit_and_lever_arm_of_the_truth(tmp_path):
     assert found.to_dict()["lever_arm"] == (0.1, -0.2, 0.3)
 
 
+def test_true_positions_are_those_of_the_body_that_the_camera_stands_in(tmp_path):
+    write_lines(tmp_path / "p.csv", ["time,x,y", "0,1,2", "0.1,2,3", "0.2,3,4"])
+    mount = "T_body_left = [[0,0,1,2],[-1,0,0,0],[0,-1,0,0.5]]\n"
+    text = f'[times]\nrate_hz = 10\n[truth]\nfile = "p.csv"\n{mount}'
+    assert opened(write_sequence(tmp_path, text)).truth_positions.lever_arm == (0.0, 0.5, -2.0)
+
+
 @pytest.mark.parametrize(
     ("more", "lines", "expected"),
     [
@@ -517,7 +524,6 @@ def test_unit_and_lever_arm_of_the_truth(tmp_path):
         ("", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-804", "0.5 s", "1 s apart")),
         ("", ["time,x,y", "44087.1,1,2", "44087.2,2,3"], ("RIL-269", "44087.100")),
         ("", ["time,x,y", "0,1,?", "1,2,3"], ("RIL-284", "line 2")),
-        ("T_body_left = [[0,0,1,2],[-1,0,0,0],[0,-1,0,0]]", ["time,x,y", "0,1,2", "0.1,2,3"], ("RIL-802",)),
     ],
 )
 def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):

@@ -346,12 +346,3 @@ def test_bed_challenges_the_rover():
         height = build_scene(p)["height"]
         risk = risk_map(height, np.zeros_like(height), p.cell, seq.mockup(MockupParams(frames=1)).vehicle)["risk"]
         assert 0.05 < (risk == 2).mean() < 0.40
-
-
-def test_a_swing_rolls_each_frame_against_the_last_and_nothing_else():
-    still, swung = (seq.body_poses(MockupParams(frames=5, roll_swing_deg=s)) for s in (0.0, 30.0))
-    for k in range(4):
-        turn = swung[k].rotation.T @ swung[k + 1].rotation
-        sign = 1.0 if k % 2 == 0 else -1.0
-        np.testing.assert_allclose(turn, rotation_exp([0.0, sign * np.radians(30.0), 0.0]), atol=1e-12)
-        np.testing.assert_array_equal(swung[k].translation, still[k].translation)

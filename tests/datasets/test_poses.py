@@ -51,6 +51,27 @@ def test_forms_of_one_pose(tmp_path, text, format):
     np.testing.assert_array_equal(found.poses[0].translation, [1, 2, 3])
 
 
+@pytest.mark.parametrize("header", ["", "time,r11,r12,r13,tx,r21,r22,r23,ty,r31,r32,r33,tz\n"])
+@pytest.mark.parametrize(("last", "separator"), [("", " "), (" 0 0 0 1", " "), ("", ",")])
+def test_matrices_behind_times(tmp_path, header, last, separator):
+    rows = ["1 0 -1 0 1 1 0 0 2 0 0 1 3", "2" + " nan" * 12, "3" + " 0" * 12, "4 1 0 0 1 0 1 0 2 0 0 1 3"]
+    text = "\n".join(separator.join((row + last).split()) for row in rows)
+    header = "" if last else header.replace(",", separator)
+    (tmp_path / "p.txt").write_text(header + text)
+    assert positions_of(read_motion(tmp_path / "p.txt"), "auto", {}) is None
+    for format in ("auto", "kitti"):
+        found = read(tmp_path, header + text, format=format)
+        assert found.times == (1.0, 4.0)
+        np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-7)
+        np.testing.assert_array_equal(found.poses[-1].translation, [1, 2, 3])
+
+
+def test_the_order_of_quaternions_without_names_between_commas_is_not_guessed(tmp_path):
+    with raises("RIL-745", 'format = "tum"'):
+        read(tmp_path, f"1.0,1,2,3,0,0,{H},{H}\n2.0,1,2,3,0,0,0,1\n")
+    assert read(tmp_path, f"1403715273262142976,1,2,3,{H},0,0,{H}\n").poses[0].rotation[1, 0] == pytest.approx(1.0)
+
+
 def test_poses_of_a_message_as_tools_of_ros_write_it(tmp_path):
     names = [
         f"field.pose.pose.{part}.{axis}" for part, of in (("position", "xyz"), ("orientation", "xyzw")) for axis in of
@@ -294,6 +315,16 @@ def test_positions_that_count_downwards_are_turned_upwards(tmp_path):
         (tmp_path / "p.csv").write_text(f"{header}\n0,5,2,3\n1,6,2,3.5\n")
         found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
         assert found.positions == ((2.0, 5.0, -3.0), (2.0, 6.0, -3.5))
+
+
+def test_positions_of_rtklib(tmp_path):
+    text = "% program : RTKPOST\n%  GPST   {}(m) {}(m) {}(m)  Q  ns\n2020/09/13 12:26:40.0 1 2 3 1 9\n"
+    path = tmp_path / "gnss.pos"
+    path.write_text(text.format("e-baseline", "n-baseline", "u-baseline"))
+    assert positions_of(read_motion(path), "auto", {}).positions == ((1.0, 2.0, 3.0),)
+    path.write_text(text.format("x-ecef", "y-ecef", "z-ecef"))
+    with raises("RIL-805", "project"):
+        positions_of(read_motion(path), "auto", {})
 
 
 def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):

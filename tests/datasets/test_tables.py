@@ -7,7 +7,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.text.tables import read_table
-from rille.datasets.text.units import ANGLES, LENGTHS, unitless
+from rille.datasets.text.units import ANGLES, FORCES, LENGTHS, RATES, unitless
 
 
 def table(tmp_path, text, encoding="utf-8"):
@@ -137,6 +137,29 @@ def test_units_are_brought_to_si_unless_the_caller_states_one(tmp_path):
     assert found.measures([1, 2, 3], LENGTHS, 0.5).tolist() == [[1.0, 1.5, 2.0]]
     with raises("RIL-995", "'x_mm'"):
         found.measures([1], ANGLES)
+
+
+@pytest.mark.parametrize(
+    ("name", "factors", "si"),
+    [
+        ("x_in", LENGTHS, 0.0254),
+        ("x_inch", LENGTHS, 0.0254),
+        ("East [inches]", LENGTHS, 0.0254),
+        ("E (US survey feet)", LENGTHS, 1200 / 3937),
+        ("E [US ft]", LENGTHS, 1200 / 3937),
+        ("E (ftUS)", LENGTHS, 1200 / 3937),
+        ("x [dm]", LENGTHS, 0.1),
+        ("y_yd", LENGTHS, 0.9144),
+        ("x [um]", LENGTHS, 1e-6),
+        ("yaw [gon]", ANGLES, np.pi / 200),
+        ("yaw (grad)", ANGLES, np.pi / 200),
+        ("roll_mrad", ANGLES, 1e-3),
+        ("gyro_x [mdps]", RATES, np.pi / 180e3),
+        ("acc_x [mg]", FORCES, 9.80665e-3),
+    ],
+)
+def test_units_of_surveyors_and_of_makers_of_sensors(tmp_path, name, factors, si):
+    assert table(tmp_path, f"time,{name}\n1,2\n").measures([1], factors) == pytest.approx(2 * si, rel=1e-12)
 
 
 def test_a_line_of_unit_words_below_a_title_is_a_line_of_names(tmp_path):

@@ -194,7 +194,7 @@ def test_one_risk_parameter_reruns_risk_path_and_what_reads_them(cold: Path) -> 
     assert {label.split("/")[0] for label in labels} == {"risk", "path", "path_check", "output"}
     drawn = {label.removeprefix("output/") for label in labels if label.startswith("output/")}
     assert {"risk.tif", "Map", "facts"} <= drawn
-    assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Trajectory", "Disparity"}
+    assert not drawn & {"dem.tif", "terrain.zarr", "trajectory.tum", "Trajectory", "Elevation error"}
 
 
 def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(cold: Path, tmp_path: Path) -> None:

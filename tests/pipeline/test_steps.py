@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import xarray
 from raising import raises
 
@@ -18,7 +19,6 @@ from rille.pipeline import steps
 from rille.pipeline.cli import main
 from rille.pipeline.engine import events
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.read_dem import read_disparity
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 VEHICLE = {"wheel_diameter": 0.05, "track": 0.08, "wheel_base": 0.1, "clearance": 0.03, "max_step": 0.012}
@@ -127,7 +127,8 @@ def test_match_has_the_values_of_the_command(pair: rille.StereoPair, tmp_path: P
         main(["match", *(str(tmp_path / f"{c}.png") for c in ("left", "right")), "--dense", "-o", str(out)])
     images = [cv2.imread(str(tmp_path / f"{c}.png"), cv2.IMREAD_GRAYSCALE) for c in ("left", "right")]
     found = rille.match(*images)
-    column, row = read_disparity(out, images[0].shape)
+    with rasterio.open(out) as file:
+        column, row = file.read()
     np.testing.assert_array_equal(found.column_disparity, column)
     np.testing.assert_array_equal(found.row_disparity, row)
 
@@ -213,6 +214,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         rille.hazards(dem, vehicle=3)
     with raises("RIL-027", "vehicle.wings"):
         rille.hazards(dem, vehicle={"wings": 2})
+    with raises("RIL-027", "path.target = 3"):
+        rille.path(rille.hazards(dem), goal=3)  # type: ignore[arg-type]
 
 
 def test_what_a_user_draws_into_an_image_stays_with_them() -> None:

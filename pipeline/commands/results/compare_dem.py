@@ -143,12 +143,6 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
         text = "no cell is left that both know"
         raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
     figures["completeness"] = _completeness(error, on_b, a)
-    factor = evaluation.relief_factor(on_a, on_b)
-    # Between two models of one ground; a foot is .3 m.
-    if not 0.5 < factor < 2.0:
-        doubt = f"is one of them in another unit{', or of depths' if factor < 0.0 else ''}?"
-        text = f"the relief of {b.name} is that of {a.name} times {1.0 / factor:.3g}: {doubt}"
-        figures["warnings"].append(warning("RIL-963", text))
     slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
     edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
     figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}

@@ -193,10 +193,6 @@ def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float
 
 def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
     """Reasons to doubt the result, one line each with its figure."""
-    for r in rig.residuals:
-        if not r.used:
-            text = f"view {r.name} is left out: its corners miss by {r.worst:.2f} px RMS; remove or retake it"
-            yield warning("RIL-695", text)
     # More than a chessboard on paper leaves.
     if rig.rms > 1.0:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
@@ -229,7 +225,7 @@ def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:
     yield f"{'view':{width}s}  left px  right px  epipolar px"
     for r in rig.residuals:
         row = f"{r.name:{width}s}  {r.left:7.3f}  {r.right:8.3f}  {r.epipolar:11.3f}"
-        yield row if r.used else f"{row}  left out: far above the others"
+        yield row if r.used else f"{row}  left out: far above the others; remove or retake it"
     yield from (f"{name:{width}s}  left out: {reason}" for name, reason in boards.left_out)
 
 

@@ -181,11 +181,7 @@ class Inspection:
         rig = self.sequence.rig
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
-        matching = judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given)
-        self.say(matching)
-        if matching.level == "FAIL":
-            mirror = yield self.make.mirrored(pair)
-            self.say(judge.judge_mirror(mirror.meta["fitting"]))
+        self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
         if len(left):
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
-from numpy.typing import NDArray
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.pipeline.engine.plain import raw, warn
@@ -19,7 +18,7 @@ from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError
 from rille.stages.core.validity import matched
 
 
@@ -33,13 +32,9 @@ class Matcher:
     preset
         Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
         follows the publication to the letter.
-    prior_disparity
-        Disparity TIFF of this left image to start from, as this command writes it; where it is undefined the search
-        starts as without it. It may err by some pixels: three and a few more from neighbours.
     """
 
     preset: Literal["default", "fast", "accurate", "paper"] | None = None
-    prior_disparity: Path | None = None
     assignments: Assignments = ()
 
     def params(self) -> Any:
@@ -57,24 +52,6 @@ class Matcher:
             text = f"--preset {self.preset} and --set hfvm.preset={values['preset']} contradict each other"
             raise ConfigError("RIL-986", text, remedy="leave one of them out")
         return configuration.validate(configuration.stages()["hfvm"].params, values, "hfvm")
-
-    def prior(self, shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]] | None:
-        """Prior disparities (rows, cols) of columns and rows, pixels, for a left image of this shape.
-
-        Raises
-        ------
-        InputError
-            They cannot be read, are of another size, or undefined everywhere.
-        """
-        if self.prior_disparity is None:
-            return None
-        from rille.pipeline.export.read_dem import read_disparity
-
-        column, row = read_disparity(self.prior_disparity, shape)
-        if not (np.isfinite(column) & np.isfinite(row)).any():
-            text = f"prior disparity {self.prior_disparity} is undefined everywhere"
-            raise InputError("RIL-045", text, remedy="leave --prior-disparity out")
-        return column, row
 
 
 def match(
@@ -110,11 +87,10 @@ def match(
     check_output(output, ".tif", ".tiff", others=taken)
     if confidence is not None:
         check_output(confidence, ".tif", ".tiff", option="--confidence", others=taken | {output.resolve(): "--output"})
-    # Images and the prior are checked before the matcher is imported, which takes seconds.
+    # Images are checked before the matcher is imported, which takes seconds.
     stored = read_grey(left), read_grey(right)
     refuse_swapped(stored, f"{left} and {right}")
     images, spread = levelled(stored)
-    prior = matcher.prior(images[0].shape)
 
     from rille.pipeline.flow import tiles
     from rille.stages.hfvm import stage as hfvm
@@ -123,7 +99,7 @@ def match(
     shapes = images[0].shape, images[1].shape
     with _progress(max(image.size for image in images)) as tell:
         how = tiles.how(tiles.Tiling(), params, PyramidParams(), shapes, tell)
-        result = hfvm.match(images[0], images[1], params, prior=prior, how=how)
+        result = hfvm.match(images[0], images[1], params, how=how)
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
     column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}

@@ -1,1 +1,1 @@
-"""How given truth is to be read: conventions of its poses and disparities, its clock, and where its body sits."""
+"""How given truth is to be read: conventions of its poses, its clock, and where its body sits."""

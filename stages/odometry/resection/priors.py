@@ -39,6 +39,8 @@ REMEDY = {
     "positions": "correct columns, unit, lever_arm or time_offset, or raise sigma",
     "up": "correct T_body_left (T_imu_left), the order of its columns or up, or raise sigma_deg",
 }
+TITLES = {name: f"[{name}]" for name in REMEDY} | {"up": "[attitude] or [imu]: the vertical"}
+"""Sensors by the tables of a manifest that state them."""
 UNLEVEL = "positions are turned about the vertical alone, and nothing tells of the vertical"
 
 
@@ -106,7 +108,9 @@ class Sensors:
     def _refuse(self, name: str, reason: str, how: str = "", remedy: str = "") -> None:
         del self.used[name]
         self.facts[name] = {"used": False, "why": reason}
-        self.lines.append(f"[{name}] {how}is not used: {reason}: {remedy or REMEDY[name]}")
+        # Each pair was levelled by it before there was a trajectory.
+        use = "is not used for the trajectory, though elevations are levelled by it" if name == "up" else "is not used"
+        self.lines.append(f"{TITLES[name]} {how}{use}: {reason}: {remedy or REMEDY[name]}")
 
     def relative_factors(self, own: OwnTrajectory) -> list[Factors]:
         """Factors of ways between frames, which may join pieces, clocks being right."""
@@ -221,7 +225,7 @@ class Sensors:
             # 0.05: share of a sensor's measurements from which on those that were left out are worth a word.
             if fact.get("left_out", 0) > 0.05 * fact.get("measurements", 0):
                 count = f"{fact['left_out']} of {fact['measurements']}"
-                self.lines.append(f"[{name}] {count} of its measurements contradict the others and are left out")
+                self.lines.append(f"{TITLES[name]} {count} of its measurements contradict the others and are left out")
 
     def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
         """State where the world lies in the frame of positions, unless that is given."""

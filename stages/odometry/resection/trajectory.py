@@ -37,7 +37,6 @@ from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, Trajectory
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
 from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
-from rille.stages.odometry.order import without_jumps
 
 
 class ChainLink(NamedTuple):
@@ -218,13 +217,7 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
         "in_world": int((piece == main).sum()),
         "lost": lost,
     }
-    rows = members[main] if members else posed
-    runs = without_jumps(found.poses[rows, :, 3])
-    order = ", ".join("-".join(str(frames[rows[k]]) for k in dict.fromkeys(run)) for run in runs)
-    line = (
-        f"the camera jumps, and would not if the frames were in the order {order}: were the images renamed or sorted?"
-    )
-    return facts | {"warnings": [*_missing(facts, causes), *([line] if runs else [])]}
+    return facts | {"warnings": list(_missing(facts, causes))}
 
 
 def _missing(facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:

@@ -77,16 +77,6 @@ def test_whole_numbers_with_a_scale_are_metres(tmp_path: Path, capsys: pytest.Ca
     assert "RIL-962: " in capsys.readouterr().err  # no unit
 
 
-@pytest.mark.parametrize(("factor", "said"), [(100.0, True), (1 / 0.3048, True), (-1.0, True), (1.3, False)])
-def test_another_unit_shows_in_the_relief(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float, said: bool
-) -> None:
-    """Neither the height of the datum nor a run that leans is taken for it."""
-    other = tiff(tmp_path / "b.tif", factor * elevation() + 50.0 + 0.1 * LATTICE.xy()[..., 0], 0.05, -1.0, 4.5)
-    assert compare(finished(tmp_path / "run"), other, output=tmp_path / "out") == 0
-    assert ("RIL-963: " in capsys.readouterr().err) is said
-
-
 def grid(path: Path, values: np.ndarray, cell: float, x0: float, y0: float) -> Path:
     """ESRI ASCII grid: lower left corner at (x0, y0)."""
     head = {"ncols": values.shape[1], "nrows": values.shape[0], "xllcorner": x0, "yllcorner": y0, "cellsize": cell}

@@ -128,6 +128,20 @@ def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
         foreign.compare(foreign.identity(), tmp_path / "probe" / "token")
 
 
+def test_an_adaptive_cluster_without_workers_starts_one(tmp_path, monkeypatch):
+    from distributed import Client, LocalCluster
+
+    monkeypatch.setattr(workers, "NO_WORKERS_SECONDS", 5.0)
+    with (
+        LocalCluster(processes=False, n_workers=0, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        cluster.adapt(minimum=0, maximum=1, interval="50ms")
+        made = workers.make(client, 1, tmp_path, 1e9)
+        assert made.threads() == 1
+        made.close()
+
+
 @pytest.mark.slow
 def test_no_workers_and_a_scheduler_that_leaves(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "NO_WORKERS_SECONDS", 2.0)

@@ -73,6 +73,17 @@ def test_unknown_key_names_the_nearest() -> None:
         config.build({"locsu": {"cell_size": 1.0}})
 
 
+def test_a_key_that_two_tables_share_and_a_section_that_is_named_twice() -> None:
+    with raises("RIL-027", "mean vehicle.track?"):
+        config.build({"risk": {"track": 0.1}})
+    for section, values in (("hfvm", {"preset": "fast"}), ("vehicle", {"track": 0.1})):
+        with raises("RIL-027", f"mean {section}.{next(iter(values))}?"):
+            config.build({section: {section: values}})
+    with raises("RIL-027") as caught:
+        config.build({"terrain": {"reference": "grond"}})
+    assert "literal" not in str(caught.value)
+
+
 def test_value_out_of_range_says_what_is_permitted() -> None:
     with raises("RIL-027", "keyframes.stride"):
         config.build(config.parse_assignments(["keyframes.stride=0"]))

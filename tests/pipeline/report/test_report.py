@@ -41,9 +41,9 @@ def test_a_whole_run_has_every_figure_and_nothing_missing(whole: Written) -> Non
     assert facts["absent"] == []
     assert facts["verdict"].startswith("Complete: ")
     assert "Nothing is missing" in page_.text
-    for anchor in ("map", "map-view", "trajectory", "elevation-error", "pairs", "stops", "disparity"):
+    for anchor in ("map", "map-view", "trajectory", "elevation-error", "pairs", "stops"):
         assert anchor in page_.ids
-    assert len(page_.images) == 6 + len(BASIC)
+    assert len(page_.images) == 5 + len(BASIC)
     assert facts["warnings"] == []
     assert "warnings-box" not in page_.ids
     assert all(image["alt"] for image in page_.images)
@@ -277,10 +277,10 @@ def test_a_figure_that_cannot_be_drawn_is_admitted(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "raster", lambda *a, **k: 1 / 0)
         facts, page_, _, _ = written(tmp_path, view(bundles()))
-    assert "disparity" not in page_.ids
+    assert "elevation-error" not in page_.ids
     assert "trajectory" in page_.ids
     lost = [m for m in facts["missing"] if m["kind"] == "figure"]
-    assert {m["what"] for m in lost} == {"Disparity", "Elevation error"}
+    assert {m["what"] for m in lost} == {"Elevation error"}
     assert all("ZeroDivisionError" in m["why"] for m in lost)
     assert not facts["complete"]
 

@@ -64,6 +64,13 @@ def test_stage_reads_what_orientation_writes():
     assert [p["pair"] for p in meta["per_pair"]] == [0, 10, 20, 30]
 
 
+def test_a_pair_without_matches_says_nothing_of_the_lenses():
+    nothing = Bundle({side: np.zeros((0, 2), np.float32) for side in ("left", "right")}, {"pair": 0, "repeated": 0.0})
+    meta = rig_stage.rig_stage.run(RigParams(), {"rig": street_rig().to_dict()}, {"orientations": [nothing]}).meta
+    assert "misread" not in meta
+    assert len(meta["warnings"]) == 1
+
+
 def test_a_sound_rig_stays_to_the_bit_and_nothing_is_warned_of():
     rig = street_rig()
     found = facts(rig, street())

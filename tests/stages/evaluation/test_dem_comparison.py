@@ -15,7 +15,6 @@ from rille.stages.evaluation.dem_comparison import (
     common,
     errors,
     figures,
-    relief_factor,
 )
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.terrain.relief.grid import Grid
@@ -195,13 +194,6 @@ def test_what_lies_higher_errs_upwards_moved_or_not() -> None:
     a = Grid(b.values + 0.5, b.matrix)
     for found in (errors(a, b), errors(a, b, RigidTransform.identity())):
         np.testing.assert_allclose(found[np.isfinite(found)], 0.5)
-
-
-def test_a_factor_is_that_of_the_reference_and_none_where_reliefs_are_unlike() -> None:
-    b, noise = terrain(), np.random.default_rng(1).normal(size=(80, 100))
-    leaning = Grid(2 * b.values + 50 + 0.1 * b.centres()[..., 0], b.matrix)
-    assert relief_factor(leaning, b) == pytest.approx(2.0)
-    assert relief_factor(Grid(b.values + noise, b.matrix), b) == 1.0
 
 
 def test_bins_leave_out_what_is_empty() -> None:

@@ -12,7 +12,7 @@ from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, refinement
 from rille.stages.hfvm.finest import lonely
 from rille.stages.hfvm.image import Layer, compact
-from rille.stages.hfvm.level import FREE_BAND, Look, paths
+from rille.stages.hfvm.level import FREE_BAND, LevelInput, paths
 from rille.stages.hfvm.native import reference
 from rille.stages.hfvm.native.problem import CANDIDATES, Field, LevelPair, pack_map, unpacked
 from rille.stages.hfvm.native.reference import NO_CANDIDATE
@@ -33,7 +33,7 @@ def view(image):
 
 def propagated(left, right, start):
     """Displacements of two images improved along paths."""
-    look = Look(1, view(left), view(right), None, FREE_BAND, 0.0, 1, ACC)
+    look = LevelInput(1, view(left), view(right), None, FREE_BAND, 0.0, 1, ACC)
     nothing = np.zeros(left.shape, np.int32)
     return unpacked(paths(look, Field(pack_map(*start), nothing)).shift)
 

@@ -3,13 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from matching_scenes import convergent_rig, pair, rig_displacement, seen
+from matching_scenes import pair, seen
 from raising import raises
 
-from rille.stages.calibration.doubt import swapped
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
-from rille.stages.hfvm import coarse
+from rille.stages.hfvm import plane, prior
 from rille.stages.hfvm.finest import isolated
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
@@ -121,36 +120,6 @@ def test_what_is_not_finite_is_masked():
     assert matched(found.validity).mean() > 0.6
 
 
-def test_order_of_two_images_is_known_where_geometry_tells_it():
-    depth = lambda x, y: 0.9 - 0.0035 * (y - 70) + 0.03 * np.sin(x / 15.0) * np.sin(y / 14.0)  # noqa: E731
-    parallel = lambda x, y: (-14.0 + 4 * np.sin(y / 20), 0.0)  # noqa: E731
-    order = {}
-    for name, displacement in (("parallel", parallel), ("convergent", rig_displacement(convergent_rig(), depth))):
-        left, right, *_ = pair(displacement)
-        for images in ((left, right), (right, left)):
-            found = match(*images)
-            ok = matched(found.validity)
-            told = swapped(found.column_disparity, found.row_disparity, ok)
-            order.setdefault(name, []).append((told, float(np.sign(np.median(found.column_disparity[ok])))))
-    # The convergent pair is in order although its disparities are positive: near things move by less than far ones.
-    assert order == {"parallel": [(False, -1), (True, 1)], "convergent": [(False, 1), (False, -1)]}
-
-
-def test_keystone_tells_swapped_convergent_cameras_and_none_of_the_rest_is_enough():
-    y, x = np.indices((200, 300), dtype=np.float64)
-    rng = np.random.default_rng(0)
-    k = -30.0 / 300**2  # far things at -30 px for a focal length of one width
-    keystone = k * (x - 149.5) * (y - 99.5) + rng.normal(0, 0.2, x.shape)
-    ok, relief = np.ones(x.shape, bool), rng.uniform(0, 3, x.shape)
-    assert swapped(2.0 + relief, keystone, ok)
-    assert not swapped(-200.0 + relief, keystone, ok)
-    assert not swapped(2.0 + relief, -keystone, ok)
-    assert not swapped(-2.0 + relief, 0 * keystone, ok)
-    # Depth that grows along the columns makes a keystone, too: then nobody can know.
-    assert not swapped(2.0 + x / 100, keystone, ok)
-    assert not swapped(20.0 + relief, keystone, ok & (x < 0))
-
-
 @pytest.mark.parametrize("blur", [0.0, 1.5, 4.0])
 def test_two_seeds_of_noise_match_hardly_anywhere(blur):
     rng = np.random.default_rng(0)
@@ -219,8 +188,8 @@ def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
     # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
     ends = np.full((64, 64), 15900.0, np.float32)
-    away = np.linalg.inv(coarse.plane.to_original(horizon, ends.shape))
-    led, near = (coarse._bounded(*coarse.plane.carried(away, u, 0 * u)) for u in (ends, 0 * ends))
+    away = np.linalg.inv(plane.to_original(horizon, ends.shape))
+    led, near = (prior.bounded(*plane.carried(away, u, 0 * u)) for u in (ends, 0 * ends))
     np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), 16000)
     assert np.isfinite(near.u).all()
 

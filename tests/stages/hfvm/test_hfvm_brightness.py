@@ -5,7 +5,7 @@ import pytest
 from matching_scenes import pair, seen
 
 from rille.stages.core.validity import matched
-from rille.stages.hfvm import coarse
+from rille.stages.hfvm import brightness
 from rille.stages.hfvm.image import Window
 from rille.stages.hfvm.image import as_matched as image_of
 from rille.stages.hfvm.level import FREE_BAND, Map, State
@@ -29,7 +29,7 @@ def state(level, u, ok):
 
 def logarithm(shape, level=0):
     y, x = np.indices(shape)
-    return np.tensordot(RATIO, coarse.terms(x, y, level, SHAPE), 1)
+    return np.tensordot(RATIO, brightness.terms(x, y, level, SHAPE), 1)
 
 
 def corners(x, y):
@@ -40,19 +40,19 @@ def corners(x, y):
 
 def test_terms_mean_the_same_place_on_each_level():
     x = np.array([0.0, 20.0, 54.0])
-    fine = coarse.terms(4 * x + 1.5, 4 * x + 1.5, 0, SHAPE)
-    np.testing.assert_allclose(coarse.terms(x, x, 2, SHAPE), fine, atol=1e-12)
+    fine = brightness.terms(4 * x + 1.5, 4 * x + 1.5, 0, SHAPE)
+    np.testing.assert_allclose(brightness.terms(x, x, 2, SHAPE), fine, atol=1e-12)
 
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_levelled_view_is_multiplied_by_the_exponential(level):
     plain = as_matched(np.random.default_rng(0).uniform(10, 200, SHAPE).astype(np.float32))
-    found = coarse.levelled(plain, RATIO)
+    found = brightness.levelled(plain, RATIO)
     window = Window(3, 30, 5, 41)
     expected = plain.layers[level].grey * np.exp(logarithm(plain.shapes[level], level))
     np.testing.assert_allclose(found.layers[level].grey, expected, rtol=1e-5)
     np.testing.assert_allclose(found.layers[level].cut(window).grey, expected[window.slices], rtol=1e-5)
-    assert coarse.levelled(plain, None) is plain
+    assert brightness.levelled(plain, None) is plain
 
 
 def test_matches_tell_the_ratio_though_a_third_is_wrong():
@@ -61,19 +61,21 @@ def test_matches_tell_the_ratio_though_a_third_is_wrong():
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
     u = np.where(rng.random(SHAPE) < 1 / 3, 7, 0).astype(np.int16)
     ok = np.arange(SHAPE[1]) < SHAPE[1] - 7
-    found = coarse.ratio_of_matches(as_matched(left), as_matched(right), state(0, u, np.broadcast_to(ok, SHAPE).copy()))
+    found = brightness.ratio_of_matches(
+        as_matched(left), as_matched(right), state(0, u, np.broadcast_to(ok, SHAPE).copy())
+    )
     y, x = np.indices(SHAPE)
     # a wrong match errs by .28 in the mean of squares; held down by the robust fit and by 2600 others
-    off = np.tensordot(found - RATIO, coarse.terms(x, y, 0, SHAPE), 1)
+    off = np.tensordot(found - RATIO, brightness.terms(x, y, 0, SHAPE), 1)
     assert np.abs(off).mean() < 0.02
-    assert coarse.ratio_of_matches(as_matched(left), as_matched(right), state(0, u, np.zeros(SHAPE, bool))) is None
+    assert brightness.ratio_of_matches(as_matched(left), as_matched(right), state(0, u, np.zeros(SHAPE, bool))) is None
 
 
 def test_guess_of_one_scene_in_two_lights():
     left = np.random.default_rng(2).uniform(60, 120, SHAPE).astype(np.float32)
     right = left / np.exp(logarithm(SHAPE)).astype(np.float32)
-    found = coarse.guess(as_matched(left), as_matched(right), 2)
-    assert coarse.greatest(found - RATIO) < 0.1 < coarse.greatest(RATIO)
+    found = brightness.guess(as_matched(left), as_matched(right), 2)
+    assert brightness.greatest(found - RATIO) < 0.1 < brightness.greatest(RATIO)
 
 
 @pytest.mark.parametrize("preset", ["default", "fast"])
@@ -100,8 +102,8 @@ def test_equal_light_is_left_alone():
     u = np.full(shape, -3, np.int16)
     ok = np.zeros(shape, bool)
     ok[:, 6:] = True
-    found = coarse.ratio_of_matches(*views, state(level, u, ok))
-    assert coarse.greatest(found) < coarse.MIN_LOG_RATIO
+    found = brightness.ratio_of_matches(*views, state(level, u, ok))
+    assert brightness.greatest(found) < brightness.MIN_LOG_RATIO
 
 
 @pytest.mark.parametrize("side", [0, 1])

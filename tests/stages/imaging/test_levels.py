@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rille.stages.imaging.levels import levels_of, spread, swapped
+from rille.stages.imaging.levels import levels_of, levels_of_sides, spread, swapped, words
 
 
 def scene(low, high, seed=3):
@@ -59,6 +59,22 @@ def test_one_scale_holds_for_dark_and_bright_images():
     dark, bright = scene(100, 900), scene(100, 3600, 4)
     levels = levels_of([dark, bright])
     assert spread(dark, levels).max() < spread(bright, levels).max() / 2
+
+
+@pytest.mark.parametrize("factor", [16, 6, 1.9, 1])
+def test_cameras_whose_drivers_shift_bits_unlike_are_spread_each(factor):
+    dim, bright = scene(20, 3500), scene(20 * factor, 3500 * factor, 4)
+    left, right = levels_of_sides([dim], [bright])
+    assert left is not None
+    if factor < 4:
+        assert left == right == levels_of([dim, bright])
+        assert words((left, right))[0].endswith("of all images")
+    else:
+        assert left == levels_of([dim])
+        assert right == levels_of([bright])
+        assert words((left, right))[0].endswith("of left images")
+        assert spread(dim, left).max() > 0.4 * spread(bright, right).max()
+    assert levels_of_sides([dim], []) == levels_of_sides([], [dim]) == (left if factor >= 4 else levels_of([dim]),) * 2
 
 
 @pytest.mark.parametrize("spread", [3, 300, 20_000])

@@ -108,16 +108,13 @@ def test_driving_ahead_loses_the_near_ground(step):
     assert set(np.diff(run([motion(drive(step))] * (3 * expected))["basic"])) == {expected}
 
 
-def test_steps_with_few_matches_are_bounded_by_basic_pairs_and_named():
+def test_steps_with_few_matches_are_bounded_by_basic_pairs():
     steps = [motion(shift(2.0))] * 3 + [blind()] + [motion(shift(2.0))] * 3
     meta = run(steps)
     assert meta["basic"] == [0, 3, 4]
     assert meta["why"] == ["first frame", "few matches", "few matches"]
     assert meta["overlap"][1] > 0.9
     assert meta["overlap"][2] is None
-    assert "1 of 6 steps" not in meta["warnings"][0]
-    assert "1 of 7 steps" in meta["warnings"][0]
-    assert "position 3" in meta["warnings"][0]
     assert run([blind()] * 3)["basic"] == [0, 1, 2]
     dark = Bundle({k: np.zeros_like(v) for k, v in blind().arrays.items()}, {"level": 2})
     assert run([dark, dark])["basic"] == [0, 1]
@@ -202,4 +199,4 @@ def test_frames_that_may_not_be_basic_are_the_cause_of_little_overlap():
     meta = keyframes.keyframes_stage.run(KeyframesParams(), given, steps).meta
     assert meta["basic"] == [0, 8]
     (line,) = meta["warnings"]
-    assert "between positions 0 and 8 may not be basic pairs" in line
+    assert "may not be basic pairs" in line

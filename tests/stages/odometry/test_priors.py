@@ -120,7 +120,7 @@ def tilted(truth, rng):
 
 
 WRONG = {
-    "vertical": (tilted, ("T_body_left",)),
+    "vertical": (tilted, ("[attitude] or [imu]", "elevations are levelled by it", "T_body_left")),
     "turned": (lambda truth, rng: odometry(truth, rng, mount=TURNED), ("turned by 9", "T_body_left")),
     "axes": (lambda truth, rng: odometry(truth, rng, mount=AXES), ("T_body_left",)),
     "unit": (lambda truth, rng: odometry(truth, rng, scale=1.3), ("multiplied by 0.7", "unit")),

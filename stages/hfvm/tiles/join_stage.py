@@ -16,7 +16,7 @@ from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.image import Window, whole
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
-from rille.stages.hfvm.tile_stage import Task, TileInputs, mosaic
+from rille.stages.hfvm.tiles.tile_stage import Task, TileInputs, mosaic
 
 
 @dataclass(frozen=True)

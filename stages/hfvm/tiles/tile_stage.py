@@ -187,7 +187,7 @@ _PARTS = (
     _optional("left", ("plane", *_GRID), "int16", "px", "columns, rows of displacement at level 1; 1 = consistent"),
     _optional("right", ("plane", *_GRID), "int16", "px", "the same of the right image"),
     _optional("f", _MATRIX, "float64", "1", "fundamental matrix, of level 0 or of the band at it"),
-    _optional("ratio", ("term",), "float64", "1", "logarithm of the ratio of brightness, see hfvm.coarse"),
+    _optional("ratio", ("term",), "float64", "1", "logarithm of the ratio of brightness, see hfvm.brightness"),
     _optional("alignment", _MATRIX, "float64", "1", "homography that the right image is aligned by"),
     _optional("u", _GRID, "float32", "px", "columns of displacement"),
     _optional("v", _GRID, "float32", "px", "rows of displacement"),

@@ -1,0 +1,1 @@
+"""Large pairs: each step of the matcher for one tile as a task, and the result put together."""
