@@ -1,9 +1,9 @@
 """Vertical and reference plane of one basic pair: its local frame, without any pose of another frame.
 
 The local frame of a basic pair has its origin at the left camera's centre, z up, y along the horizontal projection of
-the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
-best source at hand: a measured attitude, the rig's stated pitch, else the ground plane that the
-disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
+the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). The vertical comes from the
+best source at hand: a measured attitude, the rig's stated pitch, else the ground plane that the disparity shows. The
+ground plane is fitted in any case: it gives the range of elevations that Locus searches.
 
 A trajectory needs neither. Where no ground is seen (unless ``reference_height`` states it) and nothing gives the
 vertical either, the local frame is that of the camera: its own up is z.
@@ -183,7 +183,7 @@ def _explained(
 
 
 def _on_ground(ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, source: str) -> GroundFacts:
-    """What :func:`level` says of a pair whose ground plane is known."""
+    """Result of :func:`level` for a pair whose ground plane is known."""
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
@@ -213,7 +213,7 @@ def scene_plane(samples: Samples) -> GroundPlane:
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
-        # What is seen along a plane makes no map.
+        # A plane that is seen along itself makes no map.
         plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(65.0))))
         if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
@@ -236,7 +236,7 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
 
 
 def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
-    """What :func:`level` says of a pair whose reference plane is no ground."""
+    """Result of :func:`level` for a pair whose reference plane is no ground."""
     z = reference.up
     # Along the plane, right in the image; for a plane that holds that direction's normal alone, along the optical axis.
     right = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
@@ -263,8 +263,8 @@ def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
 
 
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
-    """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
-    # Where nothing is seen at all, 20 baselines stand for the distance.
+    """Cell size, m, from inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
+    # Without any match, 20 baselines stand for the distance.
     # A twentieth of the points may be nearer than the nearest distance: gross mismatches.
     near = 1.0 / float(np.quantile(rho, 0.95)) if rho.size else 20.0 * rig.baseline
     return rounded_cell(2.0 * near / coarser_focal(rig))

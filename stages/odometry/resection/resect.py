@@ -5,9 +5,9 @@ The landmarks are points of the segment's key frame, triangulated in its stereo 
 (:mod:`rille.stages.odometry.resection.robust_pose`). A pose is refused where the landmarks that contradict it agree
 with another one. Then all poses and the landmarks' depths are adjusted jointly
 (:mod:`rille.stages.odometry.resection.bundle_adjustment`). An error of the calibration shows over the whole sequence
-only: each segment gives what it says of it, and how its poses change with it
-(:mod:`rille.stages.odometry.resection.intrinsics`). A pair whose disparities depart from the landmarks' shows that the
-rig was knocked.
+only: each segment gives its contribution, and how its poses change with it
+(:mod:`rille.stages.odometry.resection.intrinsics`). If the disparities of a pair depart from the landmarks', the rig
+was knocked.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class SegmentPoses:
 
     @staticmethod
     def unposed(points: SegmentPoints) -> SegmentPoses:
-        """Nothing is known of any frame."""
+        """Poses of which none is known."""
         count, frames = points.tracks.shape[:2]
         return SegmentPoses(
             np.full((frames, 3, 4), np.nan),
@@ -146,9 +146,9 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
 def adjust_segment(
     points: SegmentPoints, segment: SegmentPoses, cameras: SegmentCameras, params: ResectParams
 ) -> dict[str, Any]:
-    """Adjust the poses of a segment jointly with its landmarks, in place; what it says of errors of the calibration.
+    """Adjust the poses of a segment jointly with its landmarks, in place; return its part in errors of the calibration.
 
-    A frame that keeps too few landmarks keeps the pose of its resection. Nothing is said where no frame is adjusted.
+    A frame that keeps too few landmarks keeps the pose of its resection. None: no frame is adjusted.
     """
     start = PosedTracks.of(points, segment.poses, segment.inlier)
     end = start and start.adjusted(adjust(start.tracks, start.state, params).state)

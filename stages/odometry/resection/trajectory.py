@@ -7,17 +7,17 @@ frame of a segment and ``i`` another of its frames,
     T_world_left(i) = T_world_left(k) T_local_left(k)^-1 T_local_left(i),
 
 so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the levelling of pair k is. The next
-segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
-piece of its own, in the local frame of its first basic pair.
+segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: a new piece begins,
+in the local frame of its first basic pair.
 
 If the first pair of a piece has no source of the vertical, the vertical of the first pair that has one is carried back
 along the piece. If no pair has one, the frame of the piece is that of its first camera, whose own up is z; the result
 says so.
 
-Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
-with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`). So do those of the
-calibration (:mod:`rille.stages.odometry.resection.intrinsics`). Without these the covariance is given, too: a plane of
-ground that they tilt defines the world's vertical, so that they tilt no elevation above it.
+Of each segment's own errors the covariances add up. Of errors that all segments share, as those of the calibration
+(:mod:`rille.stages.odometry.resection.intrinsics`), the errors themselves add up: they grow with the length of the way
+and not with its root (:mod:`rille.stages.odometry.resection.resect`). The covariance is also given without errors of
+the calibration: a plane of ground that they tilt defines the world's vertical, so that they tilt no elevation above it.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Chained:
 
     @staticmethod
     def unposed(frames: int) -> Chained:
-        """All frames are lost."""
+        """Poses of frames that are all lost."""
         covariance, lost = np.full((frames, 6, 6), np.nan), np.full(frames, -1, np.int16)
         return Chained(np.full((frames, 3, 4), np.nan), covariance, covariance.copy(), lost, lost.copy())
 
@@ -247,7 +247,7 @@ def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> di
 
 
 class TrajectoryInputs(NamedTuple):
-    """Segments, levels of their key frames, and what the segments say of the cameras."""
+    """Segments, levels of their key frames, and the segments' errors of the calibration."""
 
     segments: Sequence[Bundle[ResectFacts]]
     levels: Sequence[Bundle[GroundFacts]]
