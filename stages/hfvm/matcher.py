@@ -122,16 +122,16 @@ def _slopes(a):  # type: ignore[no-untyped-def]
 
 
 Tell = Callable[[float, str], None]
-"""Called with the share of the work done, 0..1, and what comes next in words."""
+"""Progress callback: takes the share of the work done, 0..1, and the name of the next part."""
 
 
 def silent(share: float, step: str) -> None:
-    """Tell nothing."""
+    """Report no progress."""
 
 
 class How(NamedTuple):
-    """How a pair is matched. ``tell``: called with the progress. ``side``: pixels of a tile, None: the whole image.
-    ``threads``: that share the work; they change no bit of the result."""
+    """Options of a match besides its parameters: progress callback ``tell``; ``side`` of a tile, pixels (None: whole
+    images); number of ``threads``, which changes no bit of the result."""
 
     tell: Tell = silent
     side: int | None = None

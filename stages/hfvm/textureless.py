@@ -182,7 +182,7 @@ def _update(region, step, sums, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _judge(region, state, found):  # type: ignore[no-untyped-def]
-    """Write what all steps together tell. Sums of absolute differences are more like two lines than like a parabola."""
+    """Write the results of all steps. Near their minimum sums of absolute differences are two lines, no parabola."""
     for y in range(found.mutual.shape[0]):
         for x in range(found.mutual.shape[1]):
             step, least = state.best[y, x], state.least[y, x]
