@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import tempfile
 
 from rille.stages.core.errors import ConfigError, RilleError
 
@@ -20,7 +21,12 @@ def translated(error: BaseException) -> RilleError | None:
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         kind = ConfigError if error.errno == errno.ENAMETOOLONG else RilleError
-        return kind("RIL-737", f"{where}{error.strerror}", remedy=remedy_of(error.errno))
+        remedy = remedy_of(error.errno)
+        if error.errno in FULL and str(error.filename).startswith(
+            f"{tempfile.gettempdir()}/{tempfile.gettempprefix()}"
+        ):
+            remedy = "free space there, or set TMPDIR to a folder that has more"
+        return kind("RIL-737", f"{where}{error.strerror}", remedy=remedy)
     library = type(error).__module__.split(".")[0]
     if library == "cv2":
         return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import tempfile
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,7 @@ def opencv_error() -> cv2.error:
     [
         (MemoryError("std::bad_alloc"), "RIL-736", "--memory-limit"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/there/file"), "RIL-737", "/there/file"),
+        (OSError(errno.ENOSPC, "full", f"{tempfile.gettempdir()}/tmpx/dem.tif"), "RIL-737", "set TMPDIR"),
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/there"), "RIL-737", "--output"),
         (opencv_error(), "RIL-738", "OpenCV"),
     ],
