@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import tempfile
 import shutil
 import subprocess
 import sys
+import tempfile
 
 import cv2
 import numpy as np
