@@ -56,6 +56,15 @@ def test_a_name_that_is_too_long_is_an_error_of_the_command_line(capsys, words):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_link_that_leads_nowhere_and_a_folder_that_was_removed_are_named(tmp_path):
+    (tmp_path / "runs").symlink_to("/scratch/gone")
+    for path in (tmp_path / "runs", tmp_path / "runs" / "mockup" / "1"):
+        with pytest.raises(OSError) as caught:  # noqa: PT011
+            path.mkdir()
+        assert "runs is a link to /scratch/gone, which is missing" in str(translated(caught.value))
+    assert "current folder was removed" in str(translated(FileNotFoundError(errno.ENOENT, "No such file")))
+
+
 def test_other_errors_are_left_as_they_are():
     assert translated(ZeroDivisionError()) is None
 
