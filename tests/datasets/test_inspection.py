@@ -187,7 +187,11 @@ def test_positions_of_rtklib_are_found(tmp_path):
     row = "2020/09/13 12:26:4{}.0 1 2 3 1 9"
     head = "%  GPST  e-baseline(m) n-baseline(m) u-baseline(m) Q ns"
     write_lines(tmp_path / "gnss.pos", ["% program : RTKPOST", head, row.format(0), row.format(1)])
-    assert inspect(tmp_path).tables == {"positions": ["gnss.pos"]}
+    found = inspect(tmp_path)
+    assert found.tables == {"positions": ["gnss.pos"]}
+    assert '[positions]  # optional: GNSS; the trajectory is adjusted to it\n# file = "gnss.pos"' in manifest_text(
+        found, "."
+    )
 
 
 def test_true_positions_that_cannot_be_read_are_told(tmp_path):
