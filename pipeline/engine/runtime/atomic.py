@@ -32,7 +32,8 @@ def replacing(path: Path) -> Iterator[Path]:
     apart = _beside(path)
     # A folder of its own: writers that choose the format by the file name see the final name, and files that they put
     # beside it (GDAL does) are removed with the folder.
-    apart.mkdir()
+    with named(path):
+        apart.mkdir()
     try:
         with named(path):
             yield apart / path.name
@@ -104,11 +105,12 @@ def remove(path: Path, modified: float) -> None:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Name the file in errors of a block; that of a write to a full disk has no name."""
+    """Name the file in errors of a block: that of a write to a full disk has no name, others that of a leftover."""
     try:
         yield
     except OSError as error:
-        error.filename = error.filename or str(path)
+        if not error.filename or LEFTOVER in str(error.filename):
+            error.filename = str(path)
         raise
 
 
