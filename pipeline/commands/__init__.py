@@ -1,1 +1,1 @@
-"""The commands of ``rille``, by what they look after."""
+"""The commands of ``rille``."""

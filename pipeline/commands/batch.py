@@ -1,4 +1,4 @@
-"""Several sequences in one command: each is a run as by itself, and a table says what became of all of them."""
+"""Several sequences in one command: each is a separate run, and a table has the outcome of all."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ STATES = {COMPLETE: "complete", HOLES: "with holes", USAGE: "refused", FAILED: "
 
 
 class Ended(NamedTuple):
-    """What became of a sequence: exit code, folder of its run, and seconds that it took.
+    """Outcome of a sequence: exit code, folder of its run, and seconds.
 
-    Where there is no folder, ``error`` is the code or the kind of the error.
+    Without a folder, ``error`` is the code or the type of the error.
     """
 
     sequence: str
@@ -30,14 +30,14 @@ class Ended(NamedTuple):
 
 
 def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]], *, keep_going: bool) -> list[Ended]:
-    """Call ``one`` for each sequence. After one that ends in an error the others follow if ``keep_going``."""
+    """Call ``one`` for each sequence, up to the first error unless ``keep_going``."""
     ended = []
     for number, sequence in enumerate(sequences, 1):
         print(f"rille: {sequence} ({number} of {len(sequences)})", file=sys.stderr)
         begin, wrong = time.monotonic(), ""
         try:
             code, folder = one(sequence)
-        except Exception as error:  # a fault of the program in one sequence is none of the others
+        except Exception as error:  # faults of the program too: they may not affect the others
             code, folder, known = complain(error), None, translated(error)
             wrong = type(error).__name__ if known is None else known.code
         ended.append(Ended(sequence, code, folder, time.monotonic() - begin, wrong))
@@ -48,13 +48,13 @@ def each(sequences: Sequence[str], one: Callable[[str], tuple[int, Path | None]]
 
 def worst(ended: Sequence[Ended]) -> int:
     """The most severe of the exit codes."""
-    # Exit codes, the least severe first
+    # The least severe first.
     return max((one.code for one in ended), key=(COMPLETE, HOLES, USAGE, FAILED).index)
 
 
 def table(ended: Sequence[Ended], sequences: Sequence[str]) -> str:
-    """A line for each sequence: state, share of frames with a pose, drift, what is missing, tasks, time, and the folder
-    of its run or the code of its error."""
+    """A line for each sequence: state, share of frames with a pose, drift, number of missing products, tasks, time, and
+    the folder of its run or the code of its error."""
     width = max(map(len, ("sequence", *sequences)))
 
     def line(name: str, state: str, figures: Sequence[str], end: str) -> str:
@@ -71,7 +71,7 @@ def table(ended: Sequence[Ended], sequences: Sequence[str]) -> str:
 
 
 def _figures(folder: Path | None) -> tuple[str, str, str, str, str]:
-    """Frames with a pose, drift, number of what is missing, and tasks that were computed and that were cached."""
+    """Frames with a pose, drift, number of missing products, and numbers of computed and of cached tasks."""
     from rille.pipeline.report.delivery import lacking
 
     if folder is None:

@@ -21,7 +21,7 @@ app = App(name="cache", help=__doc__)
 
 
 def _there(cache: str | None) -> Path:
-    """The folder of a cache; one that there is not was mistyped more often than it is empty."""
+    """The folder of a cache; refused if it does not exist, because it is probably mistyped."""
     folder = cache_folder(cache)
     if not folder.is_dir():
         raise ConfigError("RIL-589", f"there is no cache {folder}", remedy="name it with --cache")

@@ -1,4 +1,4 @@
-"""Errors as the command line says them: one line with a code, and an exit code."""
+"""Errors on the command line: one line with a code, and an exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LONGEST_COMPLAINT = 1000
 
 
 def complain(error: Exception, *, debug: bool = False) -> int:
-    """Print one line that says what to change, with the traceback if ``debug``; the exit code of the error."""
+    """Print an error in one line, with the traceback if ``debug``; return its exit code."""
     from rille.pipeline.engine.failures import translated
     from rille.stages.core.errors import ConfigError, InputError
 
@@ -30,6 +30,6 @@ def complain(error: Exception, *, debug: bool = False) -> int:
 def print_error(code: str, words: str) -> None:
     """Print an error in one line of at most :data:`LONGEST_COMPLAINT` characters."""
     line = one_line(words)
-    if len(line) > LONGEST_COMPLAINT:  # of what a file holds, enough to find it
+    if len(line) > LONGEST_COMPLAINT:  # it may quote a file, of which this is enough to find the place
         line = f"{line[: LONGEST_COMPLAINT // 2]} ... {line[-LONGEST_COMPLAINT // 2 :]}"
     print(f"rille: error {code}: {line}", file=sys.stderr)

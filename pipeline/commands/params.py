@@ -56,7 +56,7 @@ def plain(chosen: Mapping[str, Params]) -> Iterator[str]:
 
 
 def page(chosen: Mapping[str, Params]) -> Iterator[str]:
-    """Lines of Markdown: a table a section."""
+    """Lines of Markdown: one table for each section."""
     yield "# Parameters\n\nSet one by `--set section.key=value`, or in a TOML file given by `--config`.\n"
     for name, values in chosen.items():
         yield f"## {name}\n\n| key | default | permitted | meaning |\n|---|---|---|---|"
@@ -67,7 +67,7 @@ def page(chosen: Mapping[str, Params]) -> Iterator[str]:
 
 
 def rows(values: Params) -> Iterator[tuple[str, str, str, str]]:
-    """Key, default as TOML, what is permitted, and meaning of each parameter of a section."""
+    """Key, default as TOML, permitted values, and meaning of each parameter of a section."""
     for key, value in values.model_dump(mode="json").items():
         field = type(values).model_fields[key]
         default = "not set" if value is None else tomli_w.dumps({key: value}, indent=0).partition("=")[2].strip()
@@ -76,7 +76,7 @@ def rows(values: Params) -> Iterator[tuple[str, str, str, str]]:
 
 def _permitted(field: FieldInfo) -> str:
     """Choices or bounds in words."""
-    # The union of a choice with None has its Literal one level down.
+    # In the union of a choice with None the Literal is one level down.
     kinds = (field.annotation, *get_args(field.annotation))
     choices = [repr(c) for kind in kinds for c in get_args(kind) if get_origin(kind) is Literal]
     signs = [(sign, getattr(limit, name, None)) for limit in field.metadata for name, sign in SIGNS.items()]

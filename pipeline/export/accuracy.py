@@ -1,4 +1,4 @@
-"""``accuracy.json``: every error against truth that the assessing stages give, for programs."""
+"""``accuracy.json``: all errors against truth, for programs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rille.pipeline.export.view import RunView
 
 
 def _write(path: Path, run: RunView) -> None:
-    """Write the figures by what they judge; those of a pair by its frame. Nothing where nothing was compared."""
+    """Write the figures by the judged product; those of a pair by its frame. No file if nothing was compared."""
     p = run.products
     by_pair: dict[str, Mapping[int, Any]] = {"disparity": p.disparity_accuracy, "elevation": p.local_dem_accuracy}
     whole = {"trajectory": p.accuracy or p.position_accuracy, "merged_elevation": p.dem_accuracy, "path": p.path_check}

@@ -1,4 +1,4 @@
-"""Small readers of artifacts that several parts of the report share."""
+"""Small readers of artifacts, shared by parts of the report."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from rille.stages.geometry.geometry import Rig
 
 
 def used_rig(view: RunView, pair: int) -> Rig:
-    """The rig that a basic pair was reconstructed with: as given, where nothing else is known."""
+    """The rig that a basic pair was reconstructed with; as given if no other is known."""
     bundle = view.bundle(view.products.rigs.get(pair))
     return view.sequence.rig if bundle is None or "rig" not in bundle.meta else Rig.from_dict(bundle.meta["rig"])
 
 
 def image(view: RunView, frame: int) -> Bundle | None:
-    """The left image that was matched and tracked: free of distortion."""
+    """The left image that was matched and tracked, free of distortion."""
     ideal = view.bundle(view.products.undistorted.get(frame))
     return ideal if ideal is not None else view.bundle(view.products.images.get(frame))
 
 
 def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
-    """An array of an artifact with one row for each chosen frame, NaN where it has none."""
+    """An array of an artifact with one row for each chosen frame, NaN for frames without one."""
     values = np.asarray(bundle[name], dtype=np.float64)
     frames = list(bundle.meta.get("frames") or view.frames[: len(values)])
     return rigid.by_frame(values, frames, list(view.frames))
 
 
 def chain(view: RunView) -> tuple[int, ...]:
-    """Frames that the trajectory goes through, in order; all chosen ones where nothing else is known."""
+    """Frames of the trajectory, in order; all chosen ones if there is no trajectory."""
     bundle = view.bundle(view.products.screening)
     return view.frames if bundle is None else tuple(int(f) for f in bundle.meta["chain"])

@@ -1,8 +1,8 @@
-"""All files that a run can have, each by its row, and ``frames.json``.
+"""The table of all files that a run can have, and ``frames.json``.
 
-Every module of this folder that has ``OUTPUTS`` is found: there is no list to add it to.
+Every module of this folder that has ``OUTPUTS`` belongs to it, without another list.
 
-``frames.json`` says in which frame, unit and order every file of a run is written, for who reads them with a program.
+``frames.json`` describes frame, unit and order of the values in every file of a run, for programs.
 """
 
 from __future__ import annotations
@@ -40,12 +40,13 @@ OUTPUTS = (
 )
 
 RENDERED = frozenset(output.name for output in OUTPUTS if output.write is None)
-"""Files that each run writes anew, for they say when and where it was: with equal results they differ all the same."""
+"""Files that each run writes anew, because they state time and place of the run; they differ even for equal results."""
 
 
 def listed(folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Name, meaning and programs of all that a run's folder holds; files that are none of a run last, by name alone."""
-    # The page lists itself, though it is written only after its list.
+    """Name, meaning and programs of all files in a run's folder; files that are not of a run come last, with the name
+    alone."""
+    # The page lists itself, although it is written after its list.
     left = {p.name for p in folder.iterdir() if not p.name.startswith(".")} | {"report.html", "report.json"}
     for output in OUTPUTS:
         for name in sorted(n for n in left if fnmatchcase(n, output.name)):
@@ -88,7 +89,7 @@ CONVENTIONS = {
     "world": "engineering CRS, metres: x, y and z of the world frame",
     "georeference": "that CRS, metres: easting, northing, height; rasters are turned by the azimuth, not resampled",
 }
-"""How poses and rasters are written, and what the coordinates of a file in either frame are."""
+"""Conventions of poses and rasters, and coordinates of files by their frame."""
 
 
 def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[str, Any]:
@@ -102,14 +103,14 @@ def describe(written: Sequence[str], run: RunView, vertical: str = "") -> dict[s
     times, place, names = run.sequence.times, run.sequence.georeference, run.sequence.frame_names
     world = FRAMES["world"] | OTHER_WORLDS.get(vertical, {}) | {"definition": WORLDS.get(vertical, FRAME)}
     world |= {"vertical": vertical} if vertical else {}
-    # Endings of the files whose coordinates are those of the sequence's CRS where it has one
+    # Endings of files with coordinates in the sequence's CRS, if it has one.
     placed = (".tif", ".gpkg") if place is not None else ()
     known = {
         o.name: {"frame": "georeference" if o.name.endswith(placed) else o.frame, "holds": o.what}
         for o in OUTPUTS
         if o.name in written and o.frame
     }
-    # Raised when the meaning of a key of frames.json changes
+    # Increased when the meaning of a key of frames.json changes.
     return {
         "format": 2,
         "units": {"length": "m", "angle": "rad, deg where the name says so", "time": "s" if times else "frame number"},

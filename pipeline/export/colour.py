@@ -1,9 +1,8 @@
-"""The ortho image of a run in colour, where its left images have colours.
+"""The ortho image of a run in colour, if its left images have colours.
 
 Matching, elevation models and their merging use grey values alone, and the merged grey is free of differences of
-exposure. Colour is added afterwards: for each cell the left image of the pair with the greatest weight there gives the
-difference between each colour channel and the image's grey, which is added to the merged grey. So colours have no seams
-of exposure.
+exposure. Colour is added afterwards: for each cell, in the left image of the pair with the greatest weight there, the
+difference between each colour channel and the grey is added to the merged grey. So colours have no seams of exposure.
 """
 
 from __future__ import annotations
@@ -21,23 +20,23 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
 LUMA = np.array([0.299, 0.587, 0.114])
-"""Grey of red, green and blue, as the images were made grey (ITU-R BT.601)."""
+"""Weights of red, green and blue in grey (ITU-R BT.601), as in the conversion of the images to grey."""
 
 
 def reads(run: RunView) -> tuple[object, ...]:
-    """What the colours take of a run, besides its merged terrain."""
+    """Inputs of the colours besides the merged terrain."""
     p = run.products
     return p.images, p.undistorted, p.trajectory, p.rigs, run.sequence.rig
 
 
 def coloured(view: RunView, source: NDArray[Any]) -> bool:
-    """Whether a left image of the pairs in ``source`` has colours; one that is dark has none, whatever the others."""
+    """Whether any left image of the pairs in ``source`` has colours; a dark one may have none."""
     images = (artifacts.image(view, int(pair)) for pair in np.unique(source))
     return any(image is not None and "colour" in image.arrays for image in images)
 
 
 def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """Red, green and blue (row, col, 3) of the merged cells, 1..255; 0 where nothing is known.
+    """Red, green and blue (row, col, 3) of the merged cells, 1..255; 0 for unknown cells.
 
     Parameters
     ----------
@@ -61,5 +60,5 @@ def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -
         bands = np.moveaxis(image["colour"], 2, 0)
         colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)
         colours[here] += colour - (colour @ LUMA)[:, None]
-    # 0 means unknown in the file: a black that was seen becomes 1.
+    # 0 means unknown in the file: a known black becomes 1.
     return np.where(known[..., None], np.clip(np.rint(colours), 1, 255), 0).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Our trajectory beside that of the crosscheck, frame by frame: for the report and for the exported files."""
+"""Our trajectory beside the crosscheck's, frame by frame, for the report and for exported files."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ from rille.stages.geometry.rigid import posed
 
 @dataclass(frozen=True)
 class CrosscheckComparison:
-    """Our trajectory and that of the crosscheck, one row a chosen frame, NaN where either has no pose.
+    """Our trajectory and the crosscheck's, one row for each chosen frame, NaN where either has no pose.
 
-    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world, NaN where ours is in a piece apart.
-    ``registered`` (frame,): whether the crosscheck has posed it, in whatever piece. ``distance`` m, ``angle`` rad:
+    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world, NaN where ours is in another piece.
+    ``registered`` (frame,): whether the crosscheck has a pose, in any piece. ``distance`` m, ``angle`` rad:
     disagreement of the poses; ``step_distance``, ``step_angle``: of the motion since the frame before. ``error``,
-    ``error_crosscheck`` m: distance of either from the truth, first poses equal. ``flagged``: not to be trusted without
-    a look.
+    ``error_crosscheck`` m: distances from the truth, first poses equal. ``flagged``: the pose may be wrong.
     """
 
     frames: tuple[int, ...]
@@ -41,7 +40,7 @@ class CrosscheckComparison:
     meta: Mapping[str, Any]
 
     def columns(self) -> dict[str, list[Any]]:
-        """Columns of ``agreement.csv`` behind the positions; distances from the truth where there is any."""
+        """Columns of ``agreement.csv`` after the positions; distances from the truth if there is one."""
         why = {int(flag["frame"]): "; ".join(flag["why"]) for flag in self.meta.get("flagged") or ()}
         errors = {"error_m": self.error, "crosscheck_error_m": self.error_crosscheck}
         return {
@@ -56,11 +55,11 @@ class CrosscheckComparison:
 
 
 def compare(view: RunView, agreement: Bundle) -> CrosscheckComparison:
-    """Frame by frame against the crosscheck, of its agreement with the trajectory."""
+    """The comparison by an artifact of stage ``agreement``."""
     poses = by_frame(view, agreement, "poses")
     registered = posed(poses)
     trajectory = view.bundle(view.products.trajectory)
-    if trajectory is not None:  # other pieces lie in frames of their own, and so do the frames lost behind them
+    if trajectory is not None:  # other pieces, with the lost frames after them, have their own frames of reference
         piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
         poses[carried(piece) != trajectory.meta["main"]] = np.nan
     return CrosscheckComparison(

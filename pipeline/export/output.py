@@ -1,12 +1,12 @@
-"""Outputs: every file of a run by one row, and the task that makes it of artifacts.
+"""Outputs: the row that describes a file of a run, and the stage that makes the file.
 
-A row says what the file is called, what writes it and of what, in which frame and unit its values are, and what opens
-it. Writer, report, ``frames.json`` and the table in the docs read nothing else.
+A row has the name of the file, its writer and the writer's inputs, the frame of its values, and programs that open it.
+Writer, report, ``frames.json`` and the table in the docs read nothing else.
 
 A file is a cached task like all others: its artifact holds its bytes, keyed by the artifacts and facts that its writer
-takes and by the code of the module that declares it. A run's folder gets a copy: what a user does to it cannot damage
-the cache, also where both are on one disk. What no input determines (times, what was computed anew) is in none of
-these files: the page and ``report.json`` are rendered by each run around what is cached.
+takes and by the code of the module that declares it. A run's folder gets a copy, so that a user's changes do not damage
+the cache. Facts of a single run (its time, which tasks it computed) are in none of these files: the page and
+``report.json`` are rendered by each run.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ class Output:
     Attributes
     ----------
     name : of the file.
-    what : what it is, in words.
+    what : its content, in words.
     opens : free programs that open it.
-    write : ``write(path, run)`` writes it, of the part of a run that is named here, with artifacts for handles; None
-        for what each run renders. It may write nothing, or for a name with a ``*`` several files beside ``path``.
+    write : ``write(path, run)`` writes it; ``run`` has the attributes named by ``needs`` and ``reads``, with artifacts
+        for handles. It may write nothing, or for a name with a ``*`` several files beside ``path``. None: each run
+        renders the file.
     frame : frame of reference of its values, a key of :data:`rille.pipeline.export.catalogue.FRAMES`; empty: none.
-    needs : products that it is made of: where one is not there as a whole, the file is not made.
-    reads : what else it takes of a run: products, of which those that are missing are None, and plain facts.
+    needs : products that it is made of; if any part of them is missing, the file is not made.
+    reads : other products and plain facts that it takes; missing products are None.
     """
 
     name: str
@@ -58,12 +59,12 @@ class Output:
     reads: Reads = lambda _: ()
 
     def names(self, run: RunView) -> tuple[object, ...]:
-        """All that it takes of a run."""
+        """All products and facts that it takes of a run."""
         return *self.needs(run), *self.reads(run)
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
-    """Declare the stage behind outputs: its module declares it as ``STAGE``, so that the module's code is its own."""
+    """Stage of some outputs; their module declares it as ``STAGE``, so that the stage's code is that of the module."""
     writers = {output.name: output.write for output in outputs}
 
     def run(params: NoParams, args: Mapping[str, Any], inputs: Mapping[str, Any]) -> Bundle:
@@ -77,7 +78,7 @@ def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
 
 
 class _Unkept(Mapping[str, AnyArray]):
-    """Arrays of an artifact, each read whenever it is asked for: a figure of all pairs could not hold all of them."""
+    """Arrays of an artifact, read anew at each access, since a figure of all pairs cannot hold all of them."""
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
@@ -99,7 +100,7 @@ class _Unkept(Mapping[str, AnyArray]):
 
 
 class Form(NamedTuple):
-    """How values of a class are written as plain JSON, and read back."""
+    """Functions that convert values of a class to plain JSON and back."""
 
     write: Callable[[Any], Any]
     read: Callable[[Any], Any]
@@ -111,11 +112,11 @@ FORMS = {
     "Georeference": Form(Georeference.to_dict, Georeference.from_dict),
     "Vehicle": Form(methodcaller("model_dump", mode="json"), Vehicle.model_validate),
 }
-"""Facts that are not plain, by the names of their classes."""
+"""Forms of facts that are not plain JSON, by the names of their classes."""
 
 
 def _restored(form: Any, bundles: Sequence[Bundle]) -> Any:
-    """What a plain form stands for, with artifacts for handles."""
+    """The value of a plain form, with artifacts for handles."""
     if isinstance(form, list):
         return tuple(_restored(item, bundles) for item in form)
     if not isinstance(form, dict):
@@ -134,11 +135,11 @@ def _restored(form: Any, bundles: Sequence[Bundle]) -> Any:
 
 
 def pack(folder: Path) -> Bundle:
-    """All files below a folder as an artifact: names and sizes, and their bytes."""
-    # Sorted: file systems list a folder in any order, and equal files must make equal artifacts.
+    """Artifact of all files below a folder: names, sizes and bytes."""
+    # Sorted, since file systems list folders in any order, and equal files must make equal artifacts.
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
     data = np.frombuffer(b"".join(files.values()), dtype=np.uint8)
-    # Rows of 1024 bytes: a chunk of an artifact is 1024 x 1024 then.
+    # Rows of 1024 bytes make chunks of 1024 x 1024.
     blocks = np.zeros((-(-len(data) // 1024), 1024), dtype=np.uint8)
     blocks.reshape(-1)[: len(data)] = data
     return Bundle({"content": blocks}, {"files": [[name, len(content)] for name, content in files.items()]})
@@ -150,7 +151,7 @@ def unpack(bundle: Bundle) -> dict[str, bytes]:
     Raises
     ------
     InputError
-        It holds no such files, or a name leads out of the folder of the run: others may write to a shared cache.
+        It holds no files, or a name leads out of the run's folder, as others may write it to a shared cache.
     """
     data, at, files = np.asarray(bundle["content"]).tobytes(), 0, {}
     try:

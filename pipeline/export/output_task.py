@@ -1,6 +1,6 @@
-"""The task of an output: what its writer takes of a run as arguments and inputs of a node of the graph.
+"""The task of an output: its writer's part of a run as arguments and inputs of a node of the graph.
 
-Modules that declare outputs do not import this one, so that the code of the graph is in no key of an output.
+Modules that declare outputs do not import this one, so that keys of outputs do not depend on the code of the graph.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from rille.stages.core.declare import NoParams
 
 
 def handles(output: Output, run: RunView) -> list[Handle]:
-    """Handles of all artifacts that an output takes, each once."""
+    """Distinct handles of the artifacts that an output takes."""
     return _handles(part(run, output.names))
 
 
 def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
-    """Add the task that makes an output of ``module``; None where something that it needs is not there."""
+    """Add the task that makes an output of ``module``; None if a product that it needs is missing."""
     if not all(needed and all(map(_due, _handles(needed))) for needed in output.needs(run)):
         return None
     there: dict[Handle, int] = {}
@@ -31,7 +31,7 @@ def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handl
 
 
 def _due(handle: Handle) -> bool:
-    """Whether there is an artifact; a plan counts on those that are to be computed."""
+    """Whether there is an artifact, or a plan is to compute it."""
     return handle.ref is not None or handle.status == "planned"
 
 
@@ -44,7 +44,7 @@ def _handles(value: Any) -> list[Handle]:
 def _form(value: Any, there: dict[Handle, int], wanted: Callable[[Handle], bool]) -> Any:
     """Plain form of an input; wanted handles are collected in ``there`` and replaced by their number, others by None.
 
-    A dictionary is sorted: tasks are laid out in the order in which results come, which is not always the same.
+    Dictionaries are sorted, because the order of tasks follows that of results, which varies.
     """
     if isinstance(value, Handle):
         return {"artifact": there.setdefault(value, len(there))} if wanted(value) else None

@@ -1,7 +1,7 @@
 """The path over the merged terrain as a file for GIS programs.
 
-A GeoPackage is a SQLite file with tables of agreed names (OGC 12-128r19), which Python writes by itself: GDAL's writer
-would be a second GDAL beside rasterio's, of 100 MB.
+A GeoPackage is a SQLite file with standard tables (OGC 12-128r19), which Python can write; GDAL's writer would need a
+second GDAL beside rasterio's, of 100 MB.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
 
     Parameters
     ----------
-    planned : ``path`` (vertex, xyz) metres, world frame; where no path was found it is empty, the layer ``path`` holds
-        a feature without geometry, and there is no layer ``ends``. Its facts that are a text, a number or a truth value
-        are properties of the line.
-    place : of the world frame; the coordinates are then those of its CRS, else of the engineering CRS.
+    planned : ``path`` (vertex, xyz) metres, world frame; if no path was found it is empty, the layer ``path`` holds a
+        feature without geometry, and there is no layer ``ends``. Facts that are a text, a number or a truth value are
+        properties of the line.
+    place : of the world frame, in whose CRS the coordinates are; without it in the engineering CRS.
     """
     facts = {"name": "path", "frame": FRAME, "axes": axes(place), "unit": "m", **planned.meta}
     facts = {name: value for name, value in facts.items() if type(value) in COLUMN_TYPES}
@@ -71,13 +71,13 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
             )
         package.commit()
         content = bytearray(package.serialize())
-    # Bytes of a SQLite file that name the version of the library that wrote it, which nobody reads
+    # Version of the SQLite library that wrote the file: zero, so that equal paths make equal files.
     content[96:100] = bytes(4)
     atomic.write(path, bytes(content))
 
 
 def _enter_crs(package: sqlite3.Connection, place: Georeference | None) -> int:
-    """Number of the coordinate system within a GeoPackage, which holds it from now on."""
+    """Add the coordinate system to a GeoPackage; return its number there."""
     from rasterio.crs import CRS
 
     row = "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)"
@@ -85,7 +85,7 @@ def _enter_crs(package: sqlite3.Connection, place: Georeference | None) -> int:
     package.execute(row, ("WGS 84", 4326, "EPSG", 4326, CRS.from_epsg(4326).to_wkt()))
     crs = None if place is None else CRS.from_user_input(place.crs)
     number, wkt = (None, ENGINEERING_CRS) if crs is None else (crs.to_epsg(), crs.to_wkt())
-    # Number within a GeoPackage of a coordinate system that has none of the EPSG
+    # 100 000: number of a coordinate system without an EPSG code.
     number, owner = (100_000, "NONE") if number is None else (number, "EPSG")
     package.execute(row, (wkt.split('"')[1], number, owner, number, wkt))
     return number
@@ -103,9 +103,9 @@ def _add_layer(
     properties = features[0][1]
     columns = "".join(f', "{key}" {COLUMN_TYPES[type(value)]}' for key, value in properties.items())
     package.execute(f"CREATE TABLE {name} (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, geom {kind_name}{columns})")
-    # Without an extent, which readers of so few features find by themselves.
+    # Without an extent, which is optional.
     contents = "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, NULL, NULL, NULL, NULL, ?)"
-    # Written as time of change into every GeoPackage, so that equal paths make equal files
+    # A constant time of change, so that equal paths make equal files.
     package.execute(contents, (name, name, "2000-01-01T00:00:00.000Z", crs))
     package.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 1, 0)", (name, kind_name, crs))
     for points, values in features:
@@ -114,7 +114,7 @@ def _add_layer(
 
 
 def _geometry(kind: int, points: NDArray[np.float64], crs: int) -> bytes:
-    """Well-known binary, little-endian, of a point (3,) or a line (n, 3), behind the header of a GeoPackage."""
+    """GeoPackage geometry of a point (3,) or a line (n, 3): header and well-known binary, little-endian."""
     header = struct.pack("<2sBBi", b"GP", 0, 1, crs)
     count = struct.pack("<I", len(points)) if kind == LINE_Z else b""
     return header + struct.pack("<BI", 1, kind) + count + np.ascontiguousarray(points, dtype="<f8").tobytes()

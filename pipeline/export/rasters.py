@@ -25,7 +25,7 @@ from rille.stages.terrain.shading import hillshade, slope_deg
 GIS = "QGIS, GDAL"
 
 NODATA = {array.name: float(array.nodata or 0) for array in merge.merge_stage.outputs}
-"""Value of unknown cells by array of merged terrain."""
+"""Value of unknown cells by array of the merged terrain."""
 
 
 def tiles_of(run: RunView) -> list[Bundle]:
@@ -34,7 +34,7 @@ def tiles_of(run: RunView) -> list[Bundle]:
 
 
 def whole(tiles: Sequence[Bundle], name: str) -> tuple[Lattice, NDArray[Any]]:
-    """One array of all world tiles put together, and the union of their lattices, which it is on."""
+    """Union of the lattices of all world tiles, and one of their arrays on it."""
     lattices = [Lattice.from_dict(tile.meta["lattice"]) for tile in tiles]
     target = union(lattices)
     parts = [(part, np.asarray(tile[name])) for part, tile in zip(lattices, tiles, strict=True)]
@@ -42,11 +42,11 @@ def whole(tiles: Sequence[Bundle], name: str) -> tuple[Lattice, NDArray[Any]]:
 
 
 Raster = tuple[Lattice, Mapping[str, NDArray[Any]], Meaning]
-"""Cells of a raster, its bands by name, and what they mean."""
+"""Lattice of a raster, its bands by name, and their meaning."""
 
 
 def _dem(run: RunView) -> Raster:
-    """Elevations, or heights where the sequence has a place, m."""
+    """Elevations, m; heights of its CRS if the sequence has a place on Earth."""
     (lattice, elevation), place = whole(tiles_of(run), "elevation"), run.sequence.georeference
     height = elevation if place is None else elevation.astype(np.float64) + place.origin[2]
     return lattice, {"elevation": height}, Meaning("m", tags=plane_tag(run))
@@ -63,20 +63,20 @@ def _slope(run: RunView) -> Raster:
 
 
 def plane_tag(run: RunView) -> dict[str, str]:
-    """The frame of merged terrain in words, where its elevations are distances from a plane that is no ground."""
+    """Tag with the frame of the terrain, if its elevations are distances from a plane other than the ground."""
     return {"frame": ON_PLANE} if any("reference" in tile.meta for tile in tiles_of(run)) else {}
 
 
 def _hillshade(run: RunView) -> Raster:
     (lattice, elevation), place = whole(tiles_of(run), "elevation"), run.sequence.georeference
-    # The raster is turned by the azimuth where it has a place: there the light has to come from the map's upper left.
+    # With a place on Earth the raster is turned by the azimuth; the light comes from the upper left of the map.
     shade = hillshade(elevation, lattice.cell, 0.0 if place is None else place.azimuth)
     light = {"light": "from the upper left (315 degrees), 45 degrees high"}
     return lattice, {"hillshade": shade}, Meaning(nodata=0, tags=light)
 
 
 def _ortho(run: RunView) -> Raster:
-    """Grey values as they are, or red, green and blue where the images have colours."""
+    """Grey values, or red, green and blue if the images have colours."""
     tiles = tiles_of(run)
     lattice = whole(tiles, "ortho")[0]
     merged = {name: whole(tiles, name)[1] for name in ("ortho", "elevation", "source")}
@@ -87,15 +87,15 @@ def _ortho(run: RunView) -> Raster:
 
 
 CLASSES = {"safe": "#a6d7c3", "caution": "#f0d68a", "hazard": "#c8501e", "unknown (never entered)": "#8d8f98"}
-"""Names and colours of the classes 0, 1, 2 and 3, distinct for colour-blind eyes; in grey, what may be driven on is
-light, hazards dark, unknown medium."""
+"""Names and colours of the classes 0, 1, 2 and 3, distinct for colour-blind eyes; printed in grey, traversable cells
+are light, hazards dark, unknown ones medium."""
 
 
 def _risk(run: RunView) -> Raster:
-    """The class of each cell as a byte, with its colour and, beside it, its name."""
+    """The class of each cell as a byte, with colours; names are in a file beside it."""
     lattice, risk = _hazards(run)
     tags = {"classes": ", ".join(f"{k} {name}" for k, name in enumerate(CLASSES))} | _vehicle(risk)
-    # No nodata: class 3, unknown, is to be seen and counted like the others.
+    # No nodata: class 3, unknown, is shown and counted like the others.
     meaning = Meaning(nodata=None, tags=tags, colours=list(CLASSES.values()))
     return lattice, {"class": np.asarray(risk["risk"], np.uint8)}, meaning
 
@@ -122,7 +122,7 @@ def _hazard(run: RunView) -> Raster:
         if a.unit in ("m", "rad") and a.name != "elevation":
             bands[a.name] = np.degrees(risk[a.name]) if a.unit == "rad" else risk[a.name]
             units[a.name] = "degree" if a.unit == "rad" else a.unit
-    # Binary digits that are kept, so that measures pack well: 0.02 %, finer than any is known
+    # Keep 11 binary digits for compression: 0.02 %, finer than any measure is known.
     bits = BitRound(11)
     given = {name: bits.encode(np.asarray(v, np.float32)).view(np.float32) for name, v in bands.items()}
     return lattice, given, Meaning(units, tags=_vehicle(risk))
@@ -138,7 +138,7 @@ def _vehicle(risk: Bundle) -> dict[str, str]:
 
 
 def _terrain(run: RunView) -> tuple[object, ...]:
-    """The merged terrain: a hole in the run must not look like unknown terrain."""
+    """The merged terrain, as a whole: failed tiles must not look like unknown terrain."""
     return (run.products.world_tiles,)
 
 

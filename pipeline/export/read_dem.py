@@ -1,8 +1,8 @@
-"""Rasters read back: elevation models, from a GeoTIFF or ESRI ASCII grid or a run's folder, ortho images.
+"""Read elevation models from a GeoTIFF, an ESRI ASCII grid or a run's folder, and ortho images.
 
-Others may have written them: they are opened so that no file, nor one beside it, can name another that is then read.
-GDAL opens what a file says by any of its drivers: tiles of other files, addresses in the net. So the driver is given,
-one whose files hold all that they show; and what may lie beside a file (``.msk``, ``.ovr``, ``.aux.xml``) is not read.
+Others may have written them: no file, nor one beside it, may make GDAL read another, as by its drivers for tiles of
+other files or addresses in the net. So one of two drivers is given, whose files hold all their data, and files beside
+(``.msk``, ``.ovr``, ``.aux.xml``) are not read.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from rille.stages.core.errors import InputError
 from rille.stages.terrain.relief.grid import Grid
 
 MAX_CELLS = 500_000_000
-"""Most cells of an elevation model, which is read whole."""
+"""Most cells of an elevation model."""
 
 OURS = "give a run as Rille writes it"
 
 NO_PLACE = "give a raster that says itself where its cells are"
 
 TIFF = (b"II", b"MM")
-"""How a TIFF begins; what begins otherwise is read as an ESRI ASCII grid."""
+"""First bytes of a TIFF; any other file is read as an ESRI ASCII grid."""
 
 
 METRE = ("m", "metre", "metres", "meter", "meters")
@@ -49,10 +49,10 @@ METRE = ("m", "metre", "metres", "meter", "meters")
 class DemFile:
     """An elevation model of any program.
 
-    ``grid`` of elevations, metres, NaN unknown, in the CRS. ``crs`` WKT, empty where the file states none.
-    ``viewpoints`` (n, 2) positions of the cameras in the CRS, where they are known. ``sigma`` (rows, cols) standard
-    deviation of the elevations, metres, likewise. ``warnings``: what is suspicious but possible.
-    ``frame`` in words, where Rille wrote it.
+    ``grid`` of elevations, metres, NaN unknown, in the CRS. ``crs`` WKT, empty if the file states none.
+    ``viewpoints`` (n, 2) positions of the cameras in the CRS, if known. ``sigma`` (rows, cols) standard deviation of
+    the elevations, metres, if known. ``warnings``: suspicious but possible properties. ``frame`` in words, if Rille
+    wrote it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class DemFile:
 
 
 def transform_of(grid: Grid) -> Affine:
-    """Transform from (column, row), corners of cells at integers, to the CRS, as rasters have it."""
+    """Transform of a raster from (column, row), corners of cells at integers, to the CRS."""
     return Affine(*grid.matrix.ravel()) @ Affine.translation(-0.5, -0.5)
 
 
@@ -76,7 +76,7 @@ def _placed(values: NDArray[Any], transform: Affine) -> Grid:
 
 
 def read_elevation(path: Path) -> DemFile:
-    """The elevation model that ``path`` is or holds.
+    """Read an elevation model.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def read_elevation(path: Path) -> DemFile:
     Raises
     ------
     InputError
-        There is nothing, it is none of these, its unit is not the metre, or it has no known cell.
+        There is no such file, it is none of these, its unit is not the metre, or it has no known cell.
     """
     if not path.exists():
         remedy = "give a GeoTIFF or ESRI ASCII grid, or the folder of a run"
@@ -103,12 +103,12 @@ def _check_known(path: Path, grid: Grid) -> None:
 
 
 def _without_marks(dem: DemFile) -> DemFile:
-    """The model without values that mark what is unknown although the file does not say so, each with a warning.
+    """The model without values that mark unknown cells although the file does not declare them, each with a warning.
 
-    Such a value is the least or the greatest, and nothing lies between it and the others for more than ground can rise
-    within a cell: by a height that no wall has, or, of a value that several cells have, by as much as would be nearly
-    upright and more than all others extend. Seas, quarries and plateaus have slopes around, or are nearer. A usual mark
-    is one at a tenth of that, if its cells are scattered; a sea below a cliff stays, with a warning.
+    Such a value is the least or the greatest, and differs from all others by more than ground can rise within a cell:
+    by more than the height of any wall, or, if several cells have it, by a nearly vertical rise that exceeds the range
+    of all others. Seas, quarries and plateaus have slopes around, or differ less. For a usual mark a tenth of that is
+    enough, if its cells are scattered; a sea below a cliff stays, with a warning.
     """
     values, cell = dem.grid.values, dem.grid.cell
     least, most = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
@@ -123,7 +123,7 @@ def _without_marks(dem: DemFile) -> DemFile:
     several, apart = marked.sum() > 1, gap > high - low
     usual = apart and gap > 30.0 * cell and mark in (0.0, -1.0, -99.0, -999.0, 255.0, 999.0)
     inner = scipy.ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
-    # Nothing on Earth rises by 300 cells, or by 1500 m, over less than a cell.
+    # No ground rises by 300 cells, or by 1500 m, within one cell.
     steep = gap > 300.0 * cell and several and apart
     text = (
         f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, the others are {low:.6g} to {high:.6g} m: taken as {{}}"
@@ -139,7 +139,7 @@ def _without_marks(dem: DemFile) -> DemFile:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what rasterio prints of GDAL's complaints that quote bytes which are no UTF-8."""
+    """Suppress what rasterio prints about GDAL's messages that quote bytes other than UTF-8."""
     before, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
         yield
@@ -154,24 +154,24 @@ def opened_raster(path: Path) -> Iterator[Any]:
     Raises
     ------
     InputError
-        It cannot be read, or is a pipe or a device, on which GDAL would wait for ever.
+        It cannot be read, or is a pipe or a device, for which GDAL would wait for ever.
     """
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     with open_regular(path, "raster", sys.maxsize) as head:
         driver = "GTiff" if head.peek(2).startswith(TIFF) else "AAIGrid"
-    # By these settings GDAL looks for no masks, overviews and notes beside a file.
+    # With these settings GDAL reads no masks, overviews and metadata beside a file.
     alone = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO")
     with warnings.catch_warnings(), _quiet(), alone:
-        # Whoever needs a place refuses the file in a line of their own.
+        # Callers that need a geotransform refuse the file with their own message.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
             with rasterio.open(path, driver=driver) as file:
                 yield file
         except (RasterioError, UnicodeDecodeError) as error:
             remedy = "give a GeoTIFF, or an ESRI ASCII grid as text without a byte order mark"
-            if error.__cause__:  # GDAL has opened it, and then read less than it should have
+            if error.__cause__:  # GDAL has opened it, but not read all of it
                 remedy = "it breaks off or is damaged: copy it again"
             text = f"{path} cannot be read as a raster ({error.__cause__ or error})"
             raise InputError("RIL-629", text, remedy=remedy) from error
@@ -191,9 +191,9 @@ def read_raster(path: Path, holds: str = "elevation") -> DemFile:
     """
     with opened_raster(path) as file:
         _check_cells(path, file.shape)
-        # Whole numbers may stand for metres by the band's own scale and offset, which rasterio leaves to us.
+        # Integers may have a scale and an offset, which rasterio does not apply.
         tags, coloured = file.tags(), "red" in {band.name for band in file.colorinterp}
-        # Tags of the rasters that Rille writes: of a run, and of a comparison.
+        # Tags of Rille's rasters: of a run, and of a comparison.
         if coloured or (file.descriptions[0] != holds and not tags.keys().isdisjoint(("FRAME", "ERROR"))):
             text = f"{path} has {'colours' if coloured else file.descriptions[0]}, no {holds}"
             remedy = "give an elevation model, of a run dem.tif; rille localize takes images by --ortho"
@@ -201,7 +201,7 @@ def read_raster(path: Path, holds: str = "elevation") -> DemFile:
         values = file.read(1, out_dtype="float64", masked=True).filled(np.nan) * file.scales[0] + file.offsets[0]
         crs, transform, unit, frame = file.crs, file.transform, file.units[0], tags.get("FRAME", "")
     wkt = _checked_system(path, transform, crs)
-    # Lengths of the cell's sides, not a and e: a raster may be turned.
+    # Lengths of the cell's sides, not a and e, because a raster may be turned.
     across, down = np.hypot(transform.a, transform.d), np.hypot(transform.b, transform.e)
     if not (0.0 < abs(transform.determinant) < math.inf and np.isclose(across, down, rtol=1e-6, atol=0.0)):
         remedy = "resample it to square cells, e.g. with gdalwarp -tr"
@@ -214,7 +214,7 @@ def read_raster(path: Path, holds: str = "elevation") -> DemFile:
 
 
 def read_ortho(path: Path) -> tuple[Grid, str]:
-    """Grey image of the ground, the mean of the bands of a GeoTIFF, and its CRS (WKT), empty where it states none.
+    """Grey image of the ground, the mean of the bands of a GeoTIFF, and its CRS (WKT), empty if it states none.
 
     Raises
     ------
@@ -232,9 +232,9 @@ def read_ortho(path: Path) -> tuple[Grid, str]:
 
 
 def _check_cells(path: Path, shape: tuple[int, ...]) -> None:
-    """Refuse more cells than there is memory for, or than a file of that size can hold."""
+    """Refuse more cells than memory, or a file of that size, can hold."""
     stored = path.stat().st_size
-    # A cell takes 100 bytes until it is read, and compared or exported.
+    # 100: bytes for a cell while it is read, and compared or exported.
     most = min(MAX_CELLS, free() // 100, max(4_000_000, 50 * stored))
     if math.prod(shape) > most:
         size = f"{' x '.join(map(str, shape))} cells in {words(stored)}"
@@ -243,7 +243,7 @@ def _check_cells(path: Path, shape: tuple[int, ...]) -> None:
 
 
 def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
-    """WKT of the system of a raster, empty where it states none."""
+    """WKT of the CRS of a raster, empty if it states none."""
     if transform == Affine.identity():
         raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
     if crs is None:
@@ -251,7 +251,7 @@ def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
     if crs.is_geographic:
         remedy = "project it, e.g. with gdalwarp -t_srs"
         raise InputError("RIL-633", f"{path} is in degrees ({crs.to_string()})", remedy=remedy)
-    # rasterio knows the unit of projected systems alone; an engineering one is taken as metric.
+    # rasterio has units of projected systems alone; engineering systems are assumed to be in metres.
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
@@ -260,21 +260,21 @@ def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
 
 
 def crs_name(wkt: str) -> str:
-    """Name of a system (WKT)."""
+    """Name of a CRS (WKT)."""
     return wkt.split('"')[1] if '"' in wkt else wkt
 
 
 def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
-    """Refuse models and images that are in unlike systems.
+    """Refuse models and images of unlike CRS.
 
     Parameters
     ----------
-    stated : system of each by its name, WKT or as users write it; empty where it states none.
+    stated : CRS of each by its name, WKT or as users write it; empty if it states none.
 
     Raises
     ------
     InputError
-        Two systems differ.
+        Two CRS differ.
     """
     from rasterio.crs import CRS
 
@@ -290,7 +290,7 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
 
 
 def no_ground(name: str) -> InputError:
-    """The error of elevations that are no heights of ground, where such are wanted."""
+    """Error for elevations that are not heights of ground, where these are needed."""
     text = f"elevations of {name} are distances from a plane that is no ground"
     return InputError("RIL-842", text, remedy="run it with --set terrain.reference=ground")
 
@@ -301,7 +301,7 @@ def _of_run(path: Path) -> DemFile:
         raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
     dem, beside = read_raster(path / "dem.tif"), path / "dem_sigma.tif"
     sigma = read_raster(beside, "elevation_std").grid.values if beside.is_file() else None
-    # Another model's, of other cells, is none of this one.
+    # A raster of other cells belongs to another model.
     sigma = sigma if sigma is not None and sigma.shape == dem.grid.values.shape else None
     return replace(dem, name=str(path), viewpoints=_cameras(path), sigma=sigma)
 
@@ -310,7 +310,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     """Positions (n, 2) of the left camera in the CRS of the run's rasters."""
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
-    # Read outside of the try: an unreadable file is an error, while one with other contents has no cameras.
+    # Read outside of the try: an unreadable file is an error, while one with other content just has no cameras.
     lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run / "frames.json")
     try:
         poses, place = np.loadtxt(lines, ndmin=2), georeference_in(json.loads(frames))
@@ -321,7 +321,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 
 def frames_of(path: Path) -> dict[str, Any]:
-    """Content of a run's ``frames.json``; nothing where there is none."""
+    """Content of a run's ``frames.json``; empty if there is none."""
     return dict(json.loads(_frames(path))) if path.exists() else {}
 
 
@@ -330,7 +330,7 @@ def _frames(path: Path) -> str:
 
 
 def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
-    """Place of a run's world frame on Earth, as its :func:`frames_of` state it."""
+    """Place of a run's world frame on Earth by its :func:`frames_of`; None: it has none."""
     stated = frames.get("georeference")
     return None if stated is None else Georeference.from_dict(stated)
 
@@ -341,7 +341,7 @@ def refuse_irregular(top: Path) -> None:
     Raises
     ------
     InputError
-        It does; Rille writes none, and what a link leads to is no part of the run.
+        It does; Rille writes none, and the target of a link is no part of the run.
     """
     below = (Path(entry.path) for _, entries in Search().below(top, hidden=True) for entry in entries)
     for path in (top, *below):
@@ -350,13 +350,13 @@ def refuse_irregular(top: Path) -> None:
 
 
 def check_group(path: Path) -> None:
-    """Refuse a zarr group that is not worth opening: axes or chunks longer than any that Rille writes, or pipes.
+    """Refuse a zarr group with larger axes or chunks than Rille writes, with other codecs, or with pipes.
 
     Raises
     ------
     InputError
-        It has such an array, or one that might unpack to any size, or a file of it is no regular one: zarr would wait
-        for a pipe for ever.
+        It has such an array, or one that might unpack to any size, or a file that is not regular, such as a pipe, for
+        which zarr would wait for ever.
     ValueError, OSError, KeyError, TypeError
         It is no zarr group.
     """
@@ -365,13 +365,13 @@ def check_group(path: Path) -> None:
 
     refuse_irregular(path)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
-        # Cells; coordinates are read whole even where nothing else is
+        # 10_000_000: longest axis, because coordinates are always read whole.
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:
             size = " x ".join(map(str, array.shape))
             raise InputError("RIL-982", f"{path}: {name} has {size} values, too many to be read", remedy=OURS)
         packed = max((file.stat().st_size for file in (path / name).iterdir()), default=0)
         codecs = {getattr(codec, "codec_id", "") for codec in (*array.filters, *array.compressors)}
-        # 4_000_000 bytes of a chunk, which has 512 x 512 values: zlib makes a thousand bytes of one at most, blosc 255.
+        # 4_000_000 bytes of a packed chunk of 512 x 512 values: zlib unpacks a byte to at most 1000, blosc to 255.
         if array.metadata.zarr_format != 2 or codecs - {"zlib", "blosc"} or packed > 4_000_000:
             text = f"{path}: {name} is packed as Rille packs nothing, and may unpack to any size"
             raise InputError("RIL-997", text, remedy=OURS)

@@ -1,14 +1,14 @@
-"""The merged terrain as one zarr group that xarray and GDAL open as it is, by the CF conventions.
+"""The merged terrain as one zarr group by the CF conventions, which xarray and GDAL open.
 
-Dimensions are y (falling) and x, both with their coordinates; every variable has its unit, its long name and its frame;
-``elevation`` names in ``ancillary_variables`` what says how good it is and where it comes from (standard deviation,
-spread, number of models, pair of the greatest weight). The format is zarr 2, which GDAL reads since 3.4; of zarr 3 GDAL
-3.10 reads no array that zarr-python writes.
+Dimensions are y (decreasing) and x, both with their coordinates; every variable has its unit, its long name and its
+frame; ``ancillary_variables`` of ``elevation`` lists the variables on its accuracy and source (standard deviation,
+spread, number of models, pair of the greatest weight). The format is zarr 2, which GDAL reads since 3.4; GDAL 3.10
+reads no zarr 3 of zarr-python.
 
 The world frame is no map projection: x and y are plain axes, and a scalar coordinate ``spatial_ref`` has the
-engineering CRS, where rioxarray looks for it. CF has no ``grid_mapping`` for such a frame, so none is claimed, and no
-standard name for heights above the first camera. Where the sequence has a place on Earth, the attributes
-``georeference_*`` state it; ``dem.tif`` is in that place's system.
+engineering CRS, as rioxarray expects it. CF has no ``grid_mapping`` for such a frame, and no standard name for heights
+above the first camera, so there are none. If the sequence has a place on Earth, the attributes ``georeference_*`` state
+it; ``dem.tif`` is in that place's CRS.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from rille.stages.terrain import merge
 from rille.stages.terrain.shading import slope_deg
 
 UNITS = {"px": "1", "grey": "1"}
-"""Units that UDUNITS does not know; the long name has the word."""
+"""Replacements of units that UDUNITS does not know; ``quantity`` has the word."""
 
 
 def write_terrain(
@@ -49,8 +49,8 @@ def write_terrain(
     Parameters
     ----------
     arrays : declaration and values by name.
-    lattice : where the cells are, world frame.
-    place : of the world frame, where it is known.
+    lattice : of the cells, world frame.
+    place : of the world frame, if known.
     facts : attributes of the whole group, e.g. ``title``, ``source``.
     """
     import xarray
@@ -60,13 +60,13 @@ def write_terrain(
     variables = {name: (("y", "x"), values, _attributes(spec)) for name, (spec, values) in arrays.items()}
     others = [name for name in arrays if name not in ("elevation", "ortho", SLOPE.name)]
     variables["elevation"][2].update(positive="up", ancillary_variables=" ".join(others))
-    # In every build of GDAL. Of the coordinates stated as well: zarr's own default is another one in each version.
+    # Codecs of every GDAL build; for coordinates too, since zarr's default changes with its version.
     encoding: dict[str, Any] = {name: {"compressors": numcodecs.Blosc()} for name in ("x", "y", "spatial_ref")}
     encoding |= {name: {"compressors": numcodecs.Zlib(level=1)} for name in arrays}
     for name, (spec, values) in arrays.items():
         encoding[name]["chunks"] = tuple(min(n, 512) for n in values.shape)
         encoding[name]["_FillValue"] = np.nan if values.dtype.kind == "f" else int(spec.nodata) if spec.nodata else None
-    # zarr says that readers of other languages may not know consolidated metadata.
+    # zarr warns that other readers may not know consolidated metadata.
     with atomic.replacing(path) as folder, warnings.catch_warnings(action="ignore"):
         terrain = xarray.Dataset(variables, _coordinates(lattice), about)
         terrain.to_zarr(folder, zarr_format=2, consolidated=True, encoding=encoding, write_empty_chunks=True)
@@ -75,16 +75,16 @@ def write_terrain(
 def _attributes(spec: Array) -> dict[str, Any]:
     about: dict[str, Any] = {"units": UNITS.get(spec.unit, spec.unit), "long_name": spec.long_name}
     about |= {"quantity": spec.unit} if spec.unit in UNITS else {}
-    # _CRS is GDAL's own attribute for the system of a zarr array.
+    # _CRS is GDAL's attribute for the CRS of a zarr array.
     return about | {"frame": spec.frame or "world", "_CRS": {"wkt": ENGINEERING_CRS}}
 
 
 def _coordinates(lattice: Lattice) -> dict[str, Any]:
     half = 0.5 * lattice.cell
-    # In GDAL's order, which is not that of affine.
+    # In GDAL's order, unlike that of affine.
     corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
     reference = {
-        # crs_wkt is the name by CF, spatial_ref that by GDAL: readers look for either.
+        # crs_wkt is CF's name, spatial_ref GDAL's: readers expect either.
         "crs_wkt": ENGINEERING_CRS,
         "spatial_ref": ENGINEERING_CRS,
         "long_name": "Rille world frame (local metres)",
@@ -101,7 +101,7 @@ SLOPE = Array("slope", ("row", "col"), "float32", "degree", "inclination of the 
 
 
 def _write_output(path: Path, run: RunView) -> None:
-    """All merged arrays, put together of the world tiles, and the slope."""
+    """Write all merged arrays, assembled from the world tiles, and the slope."""
     arrays, tiles = {}, tiles_of(run)
     for spec in merge.merge_stage.outputs:
         if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):

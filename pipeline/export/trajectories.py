@@ -1,4 +1,4 @@
-"""The trajectory as files, that of the crosscheck beside it, and how far both agree."""
+"""Files of the trajectory, of the crosscheck's, and of their agreement."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rille.stages.odometry.resection.trajectory import world_poses
 
 
 def stamps(run: RunView) -> list[float]:
-    """Time of each chosen frame, seconds; its number where there is no clock."""
+    """Time of each chosen frame, seconds; its number if there is no clock."""
     times = run.sequence.times
     return [float(f) if times is None else times[f] for f in run.frames]
 

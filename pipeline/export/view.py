@@ -1,4 +1,4 @@
-"""What the report is made from: one frozen view of a run, without the engine behind it."""
+"""The data of a run that report and outputs read, without the engine."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class TaskRow:
 
     Attributes
     ----------
-    label : ``"locus/local/4"``; its first part groups it with its like.
+    label : such as ``"locus/local/4"``; tasks are grouped by its first part.
     stage : name of the stage, ``"locus"``.
-    status : what became of it in this run.
-    seconds : the time it took when it was computed, in this run or an earlier one; None where it never was.
-    reason : of a failed or skipped task: why, in one line.
-    cause : label of the task that a skipped one waits for; empty where it was left out for another reason.
+    status : outcome in this run.
+    seconds : time of its computation, in this run or an earlier one; None if it never was computed.
+    reason : why a task failed or was skipped, in one line.
+    cause : label of the task that a skipped one waits for; empty if it was skipped for another reason.
     """
 
     label: str
@@ -47,10 +47,10 @@ class Settled:
 
     Attributes
     ----------
-    sequence : what is reconstructed (:class:`rille.datasets.protocol.Sequence`).
+    sequence : the input data (:class:`rille.datasets.protocol.Sequence`).
     frames : chosen frame numbers, in order.
     config : validated configuration with all defaults, one section a stage, and ``vehicle``.
-    vehicle_source : who stated the vehicle's limits, in words.
+    vehicle_source : source of the vehicle's limits, in words.
     given : dotted keys of the configuration that the user has set.
     """
 
@@ -68,17 +68,17 @@ class RunView(Settled):
     Attributes
     ----------
     run_id : name of the run's folder.
-    products : handles of what the run was to deliver; those of failed tasks lead to no bundle.
+    products : handles of the run's products; those of failed tasks have no bundle.
     tasks : every task of the plan.
-    bundle : the artifact of a handle, None where there is none (also for None); only what makes outputs needs it.
-    config_toml : the configuration, as it was written to ``config.toml``.
+    bundle : returns the artifact of a handle, None if there is none (also for None); only makers of outputs need it.
+    config_toml : the configuration, as written to ``config.toml``.
     seconds : wall-clock time of the run so far.
     versions : distribution or program to version.
     command : the command line that repeats this run.
-    started : when, in words (ISO 8601, UTC).
+    started : time of the start (ISO 8601, UTC).
     part : the options that chose a part of the run; empty: all of it.
-    until, only : of a part: the stages whose tasks, or the files, that it is to make.
-    left_out : of a part: the known tasks that were not wanted, by stage.
+    until, only : of a part: stages whose tasks, or files, that it is to make.
+    left_out : of a part: numbers of known tasks that were not wanted, by stage.
     """
 
     products: Products
@@ -97,7 +97,7 @@ class RunView(Settled):
 
 
 class Part(SimpleNamespace):
-    """A part of a run, by the same attributes; where an output is made of it, artifacts stand for handles."""
+    """A part of a run, with the same attributes; for the writer of an output, with artifacts instead of handles."""
 
     def bundle(self, artifact: Bundle | None) -> Bundle | None:
         """The artifact itself."""
@@ -109,7 +109,7 @@ Reads = Callable[[RunView], tuple[object, ...]]
 
 
 def names(reads: Reads) -> list[str]:
-    """Dotted names of what ``reads`` names, such as ``products.trajectory``."""
+    """Dotted names of the attributes that ``reads`` takes, such as ``products.trajectory``."""
     return [str(name) for name in reads(cast(RunView, _Name()))]
 
 
@@ -121,7 +121,7 @@ def artifact(run: RunView, handle: Any) -> Bundle:
 
 
 def part(run: RunView, reads: Reads) -> RunView:
-    """The part of a run that ``reads`` names, and its frames; nothing else is within reach of who gets it."""
+    """The part of a run that ``reads`` names, and its frames, without access to anything else."""
     named = Part(frames=run.frames)
     for name in names(reads):
         *path, last = name.split(".")
@@ -134,7 +134,7 @@ def part(run: RunView, reads: Reads) -> RunView:
 
 
 class _Name:
-    """The dotted name of an attribute, made by reading it: type checkers follow what a quoted name would hide."""
+    """Dotted name of an attribute, built by attribute access, so that type checkers see it, unlike a quoted name."""
 
     def __init__(self, name: str = "") -> None:
         self._name = name

@@ -51,22 +51,22 @@ ENGINEERING_CRS = (
     'LOCAL_CS["Rille world frame (local metres)",UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
     'AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
-"""WKT 1, as GDAL reads a local system back from a GeoTIFF, which keeps its name, unit and directions alone: so all
-files state one text, and programs do not take path and rasters for two systems. The axes are not east and north; the
-tag AXES says what they are. rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
+"""WKT 1 as GDAL reads a local CRS back from a GeoTIFF, which keeps its name, unit and directions alone. With this text
+in all files, programs see path and rasters in one CRS. The axes are not east and north; the tag AXES describes them.
+rasterio's ``crs.is_valid`` is False for every engineering CRS: do not test that."""
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the values of a raster mean.
+    """Meaning of the values of a raster.
 
     Parameters
     ----------
     unit : unit of the values, or of each band by name; ``"m"`` is written as GDAL's ``metre``.
-    nodata : value of unknown cells (NaN for floats). None where every value means something; the overviews then take
-        the most frequent value, since classes have no mean.
-    tags : more metadata; the frame, the unit and the cell size are always there.
-    colours : of the values 0, 1, ... of the one band, ``#rrggbb``.
+    nodata : value of unknown cells (NaN for floats). None for classes, all of which have a meaning; overviews then take
+        the most frequent value.
+    tags : more metadata; frame, unit and cell size are always written.
+    colours : of the values 0, 1, ... of a single band, ``#rrggbb``.
     """
 
     unit: str | Mapping[str, str] = ""
@@ -80,12 +80,12 @@ class Meaning:
 
 
 def check_folder(folder: Path, ours: str = "") -> None:
-    """Refuse a folder to write that holds something, unless it holds a file named ``ours`` and so is one of ours.
+    """Refuse to write a folder that is not empty, unless it holds a file named ``ours`` and so is one of ours.
 
     Raises
     ------
     ConfigError
-        It does.
+        It is refused.
     """
     if folder.is_dir() and any(folder.iterdir()) and not (ours and (folder / ours).exists()):
         raise ConfigError("RIL-607", f"{folder} is not empty", remedy="give a new folder with --output")
@@ -100,8 +100,8 @@ def write_raster(
     ----------
     path : file to write or replace.
     bands : arrays (row, col) of one dtype on ``lattice``, by the band's name.
-    place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations have
-        to be heights in its system already.
+    place : of the world frame. The raster is not resampled: its geotransform is turned by the azimuth. Elevations must
+        be heights in its CRS already.
     """
     profile = {
         "driver": "COG",
@@ -109,7 +109,7 @@ def write_raster(
         "transform": raster_transform(lattice, place),
         "level": 1,
         "num_threads": "all_cpus",
-        # COG chooses by the dtype: differences of whole numbers (2) or of floats (3).
+        # COG chooses the predictor by the dtype: for integers (2) or for floats (3).
         "predictor": "yes",
         "blocksize": 256,
         "overview_resampling": "mode" if meaning.nodata is None else "average",
@@ -122,7 +122,7 @@ def write_raster(
 def write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning, profile: Mapping[str, Any]) -> None:
     """Write bands of one shape and dtype by GDAL; ``profile``: driver, place and packing of the file.
 
-    The file is made in memory: where the disk is full GDAL says nothing, and leaves a file that nobody can read.
+    The file is made in memory, because GDAL leaves a damaged file without an error if the disk is full.
     """
     from rasterio.enums import ColorInterp
     from rasterio.errors import NotGeoreferencedWarning
@@ -131,7 +131,7 @@ def write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning,
     first = next(iter(bands.values()))
     about = {"height": first.shape[0], "width": first.shape[1], "count": len(bands), "dtype": first.dtype.name}
     with MemoryFile() as memory, warnings.catch_warnings():
-        # A raster in the geometry of an image has no place.
+        # A raster in the geometry of an image has no geotransform.
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with memory.open(**profile, **about, nodata=meaning.nodata, compress="deflate") as file:
             for number, (name, values) in enumerate(bands.items(), start=1):
@@ -143,7 +143,7 @@ def write_bands(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning,
                 file.write_colormap(1, {k: tuple(bytes.fromhex(c[1:])) for k, c in enumerate(meaning.colours)})
             file.units = tuple("metre" if u == "m" else u for u in meaning.units(bands))
             file.update_tags(**{key.upper(): plain(value) for key, value in meaning.tags.items()})
-        # The driver COG writes as it closes.
+        # The driver COG writes on close.
         atomic.write(path, bytes(memory.getbuffer()))
 
 
@@ -160,7 +160,7 @@ def raster_transform(lattice: Lattice, place: Georeference | None) -> Any:
 
 
 def axes(place: Georeference | None) -> str:
-    """How the axes of a file's CRS lie to those of the world frame, in words."""
+    """Axes of a file's CRS relative to those of the world frame, in words."""
     if place is None:
         return "the CRS's x and y are the world frame's; rows fall with y"
     e, n, h = place.origin
@@ -171,7 +171,7 @@ def axes(place: Georeference | None) -> str:
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
-    """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); what is not known stays empty."""
+    """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); unknown values stay empty."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -183,16 +183,16 @@ def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return ""
     if isinstance(value, float):
-        # Nine digits of seconds since 1970 would be steps of ten seconds.
+        # Nine digits are too few for large values, such as seconds since 1970.
         return f"{value:.9g}" if abs(value) < 1e4 else repr(float(value))
-    # Names come from who wrote the data: what a terminal would obey is spelt out, what a spreadsheet would run quoted.
+    # Names come from the author of the data: control characters are escaped, formulas of a spreadsheet quoted.
     text = plain(str(value))
-    # A spreadsheet takes a cell that begins so for a formula, and runs it; behind an apostrophe it is text
+    # A spreadsheet runs a cell that begins so as a formula; after an apostrophe it is text.
     return f"'{text}" if isinstance(value, str) and text.startswith(("=", "+", "-", "@", "\t")) else text
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
-    """Write the 3 x 4 of every frame, row by row, a line a frame; NaN where a frame has no pose.
+    """Write the 3 x 4 matrix of every frame, row by row, one line for each; NaN for frames without a pose.
 
     Parameters
     ----------
@@ -202,22 +202,22 @@ def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:
 
 
 def write_trajectory_tum(path: Path, poses: NDArray[np.float64], times: Sequence[float], world: str = FRAME) -> None:
-    """Write ``time x y z qx qy qz qw``, a line for every frame with a pose.
+    """Write ``time x y z qx qy qz qw``, one line for every frame with a pose.
 
     Parameters
     ----------
     poses : (frame, 3, 4) T_world_left, metres; optical axes x right, y down, z forward.
-    times : of the frames, seconds; frame numbers where there is no clock.
+    times : of the frames, seconds; frame numbers if there is no clock.
     world : the frame of reference in words.
     """
     from scipy.spatial.transform import Rotation
 
     there = posed(poses)
-    # Two quaternions mean one rotation: w >= 0 makes the file unique, as frames.json says.
+    # Of two quaternions of a rotation the one with w >= 0, as frames.json says.
     turns = Rotation.from_matrix(poses[there, :, :3]).as_quat(canonical=True)
     head = f"time x y z qx qy qz qw; world from left camera (x right, y down, z forward); world {world}"
     rows = np.column_stack([np.asarray(times, np.float64)[there], poses[there, :, 3], turns])
-    # All digits of a time: microseconds since 1970 have sixteen.
+    # All digits of a time: microseconds since 1970 need sixteen.
     _write_rows(path, rows, ["%s"] + 7 * ["%.15g"], head)
 
 
@@ -242,13 +242,13 @@ def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: M
 def write_confidence(
     path: Path, std: NDArray[Any], validity: NDArray[Any], backmatch_error: NDArray[Any], tags: Mapping[str, str]
 ) -> None:
-    """Write what is known about a disparity as a float32 TIFF: ``disparity_std``, ``validity``, ``backmatch_error``.
+    """Write bands ``disparity_std``, ``validity``, ``backmatch_error`` of a disparity as a float32 TIFF.
 
     Parameters
     ----------
     std, backmatch_error : (row, col) pixels, NaN undefined.
-    validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`; written as whole numbers, and as
-        the tag ``VALIDITY`` says.
+    validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`, as described in the tag
+        ``VALIDITY``.
     tags : more metadata.
     """
     bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
@@ -259,6 +259,6 @@ def write_confidence(
 
 def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning) -> None:
     """Write arrays (row, col) on image pixels as bands of a float32 TIFF, NaN undefined."""
-    # 3 is TIFF's predictor of floats; GTiff does not choose by itself, as COG does.
+    # 3: predictor for floats, which GTiff, unlike COG, does not choose.
     profile = {"driver": "GTiff", "predictor": 3}
     write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)

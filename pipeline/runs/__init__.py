@@ -1,1 +1,1 @@
-"""A run: its folder, what it left."""
+"""A run: its options, its folder and files."""

@@ -1,4 +1,4 @@
-"""Two images without calibration: spread their grey values, and say whether they seem not to belong together."""
+"""Two images without calibration: spread their grey values, and warn if they seem not to belong together."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.imaging import levels
 
 MIN_MATCHED_SHARE = 0.05
-"""Share of matched pixels at which two images have little to do with each other; unrelated ones stay below."""
+"""Share of matched pixels below which two images seem unrelated; unrelated ones have less."""
 
 WHY_NOT = (
     (Validity.NO_TEXTURE, "have no texture (black, saturated or blank)"),
@@ -27,7 +27,7 @@ WHY_NOT = (
 
 
 def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
-    """Left and right image, their 16-bit samples spread where they use a small part of their range, and warnings."""
+    """Left and right image, with 16-bit samples spread if they use a small part of their range; and warnings."""
     used = levels.levels_of_sides(images[:1], images[1:])
     lines = [warning("RIL-705", line) for line in levels.words(used)]
     return [levels.spread(i, of) for i, of in zip(images, used, strict=True)], lines
@@ -36,7 +36,7 @@ def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:
     """Signs that two matched images do not fit, one line each with its figure; ``result``: their ``StereoMatches``.
 
-    One that explains all others stands alone. ``closely``: compare samples of the images, too, which takes half a
+    A sign that explains all others is the only one. ``closely``: compare samples of the images too, which takes half a
     second.
     """
     one = warning("RIL-708", "left and right are one image") if np.array_equal(left, right) else ""
@@ -53,10 +53,7 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
 
 
 def _unmatched(result: Any) -> str:
-    """That hardly a pixel matches, and the two most frequent reasons.
-
-    They tell a user whether the light, the order or the scene is at fault.
-    """
+    """Warning that hardly a pixel matches, with the two most frequent reasons, which hint at light, order or scene."""
     share = float(matched(result.validity).mean())
     if share >= MIN_MATCHED_SHARE:
         return ""
@@ -69,12 +66,12 @@ def _unmatched(result: Any) -> str:
 def _without_texture(result: Any) -> str:
     share = float(has(result.validity, Validity.NO_TEXTURE).mean())
     text = f"{100 * share:.0f} % of the pixels have no texture (black, saturated or blank) and cannot match"
-    # Half of the image is worth a word, however well the rest matches.
+    # Half of the image deserves a warning, however well the rest matches.
     return warning("RIL-701", text) if share > 0.5 else ""
 
 
 def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iterator[str]:
-    """That matches contradict each other, or could as well be others."""
+    """Warnings that matches contradict each other, or look as well elsewhere."""
     from rille.stages.calibration import doubt
 
     judged = doubt.judge(left, right, result, matched_back(result.validity, result.backmatch_error))

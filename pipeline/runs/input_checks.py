@@ -1,7 +1,7 @@
-"""Judge the figures of a sequence against a table of limits: one finding a subject, with a code and a remedy.
+"""Judge the figures of a sequence by a table of limits: one finding for each subject, with a code and a remedy.
 
-A sequence or plain numbers in, findings out; :mod:`rille.pipeline.commands.sequences.check` measures the numbers. FAIL:
-a reconstruction is useless or impossible. WARN: it gets worse, or the input is probably a mistake.
+Inputs are a sequence or plain numbers, which :mod:`rille.pipeline.commands.sequences.check` measures. FAIL: a
+reconstruction is useless or impossible. WARN: it gets worse, or the input is probably a mistake.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Frames = Series[int]
 Poses = Series[RigidTransform | None]
 
 MAX_SPEED = 60.0
-"""m/s between most records of a sensor, which no vehicle with stereo cameras drives."""
+"""m/s: largest speed between most records of a sensor; no vehicle with stereo cameras is faster."""
 
 
 @dataclass(frozen=True)
 class InputLimit:
-    """A finding has this code and remedy where the figure lies below ``least`` or above ``most``."""
+    """Code and remedy of a finding if a figure is below ``least`` or above ``most``."""
 
     code: str
     figure: str
@@ -58,7 +58,7 @@ class Fault(InputLimit):
 LIMITS = {
     "rig": (
         Fault("RIL-640", "baselines to the left", most=0.5, remedy="swap left and right"),  # of the right camera
-        # Outside, lengths in another unit are likelier than such a rig.
+        # Outside of these limits another unit of length is likelier than such a rig.
         InputLimit("RIL-641", "baseline, m", least=0.01, most=5.0, remedy="is the baseline in metres?"),
         InputLimit("RIL-642", "ratio of the focal lengths", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
     ),
@@ -78,13 +78,13 @@ LIMITS = {
     ),
     "positions": (
         Fault("RIL-989", "m/s", most=MAX_SPEED, remedy="check their unit, and the unit of the times"),
-        # Fewer hold no rotation of a trajectory.
+        # Fewer do not determine a rotation.
         InputLimit("RIL-990", "rows", least=3, remedy="is time_offset right, and the clock the images'?"),
         InputLimit("RIL-991", "lengths over sigma", least=1.0, remedy="they say nothing of so short a way"),
     ),
     "up": (
         InputLimit("RIL-648", "known", least=1, remedy="the ground is levelled by its own plane"),
-        # Camera frames have y downwards: up has a negative y where a camera is held upright.
+        # y points down in camera frames: up has a negative y in an upright camera.
         InputLimit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
     ),
     "images": (
@@ -96,7 +96,7 @@ LIMITS = {
         InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
     ),
     "exposure": (
-        # A white sky takes less than this; more means clipped ground.
+        # A white sky is less than this; more means clipped ground.
         InputLimit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
         # The matcher removes the mean, but not the noise.
         InputLimit("RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix exposure"),
@@ -158,7 +158,7 @@ LIMITS = {
         ),
     ),
     "simultaneous": (Fault("RIL-665", "contradictions", most=0, remedy="pair the images anew"),),
-    "motion": (  # tracking needs most of a left image in the next one
+    "motion": (  # tracking needs most of a left image to be in the next one
         Fault("RIL-666", "overlap", least=0.1, remedy="the trajectory breaks there; add frames between, or split it"),
         InputLimit("RIL-667", "overlap", least=0.4, remedy="take every frame, or expect weak poses there"),
         InputLimit(
@@ -170,12 +170,12 @@ LIMITS = {
         ),
     ),
 }
-"""Limits of the figures of each subject, the worst first."""
+"""Limits of the figures of each subject, the most severe first."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of ``rille check``: a figure of ``subject`` in words, and what to do; ``code`` where it is not OK."""
+    """One line of ``rille check``: figures of ``subject`` in words, a remedy, and a ``code`` if it is not OK."""
 
     code: str
     text: str
@@ -189,7 +189,7 @@ class Finding:
 
 
 def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -> Finding:
-    """Return the finding of the first limit that a figure of the subject, by name, does not keep; else an OK one."""
+    """Finding of the first limit that a figure of the subject, by name, exceeds; else an OK one."""
     for limit in LIMITS.get(subject, ()):
         figure = (figures or {}).get(limit.figure)
         if figure is not None and not limit.least <= figure <= limit.most:
@@ -198,9 +198,9 @@ def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -
 
 
 def judge_rig(rig: Rig) -> Finding:
-    """Baseline and sides, as the calibration has them."""
+    """Baseline, sides and focal lengths of the calibration."""
     left, right, b, x = rig.left, rig.right, rig.baseline, -float(rig.centre[0])
-    # In pixels and in image widths: one lens before sensors of unlike pixels, or of unlike width, is no mistake.
+    # In pixels and in image widths: equal lenses with sensors of unlike pixels, or of unlike width, are no mistake.
     ratios = right.fx / left.fx, right.fx / left.fx * left.width / right.width
     unlike = min(max(ratio, 1 / ratio) for ratio in ratios)
     words = f"baseline {b:g} m, focal length {left.fx:g} px, {left.width} x {left.height}"
@@ -211,7 +211,7 @@ def judge_rig(rig: Rig) -> Finding:
     return judge("rig", words, figures)
 
 
-# -- what is recorded of each frame: of a sequence, some of whose frames are chosen ---------------------------------
+# -- records of the chosen frames of a sequence ----------------------------------------------------------------------
 
 
 def judge_times(of: Sequence, frames: Frames) -> Finding:
@@ -231,7 +231,7 @@ def judge_times(of: Sequence, frames: Frames) -> Finding:
 
 
 def judge_truth(of: Sequence, frames: Frames) -> Finding:
-    """How many frames have truth, and how long the way is."""
+    """Number of frames with truth, and length of the path."""
     if of.truth is not None:
         known = [k for k in frames if of.truth[k] is not None]
         words = f"{len(known)} of {len(frames)} frames, {_length(of.truth, known):.4g} m"
@@ -246,7 +246,7 @@ def judge_truth(of: Sequence, frames: Frames) -> Finding:
 
 
 def judge_odometry(of: Sequence, frames: Frames) -> Finding | None:
-    """Coverage, length and speed of the dead reckoning, and whether truth is as long."""
+    """Coverage, length and speed of the dead reckoning, and its length over the truth's."""
     if of.odometry is None:
         return None
     known = [k for k in frames if of.odometry[k] is not None]
@@ -263,7 +263,7 @@ def judge_odometry(of: Sequence, frames: Frames) -> Finding | None:
 
 
 def judge_positions(of: Sequence, frames: Frames) -> Finding | None:
-    """How many measured positions are of the images' time, and how far and how fast they lead."""
+    """Number of measured positions at the time of the images, their length and speed."""
     if (measured := of.priors.get("positions")) is None:
         return None
     at, places = np.array(measured["times"]), np.array(measured["positions"])
@@ -280,7 +280,7 @@ def judge_positions(of: Sequence, frames: Frames) -> Finding | None:
 
 
 def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
-    """Coverage of the attitude, which may be that of an IMU, and whether it turns as truth does."""
+    """Coverage of the attitude, possibly of an IMU, and whether its turns are those of the truth."""
     if of.attitude is None:
         return None
     known = [k for k in frames if of.attitude[k] is not None]
@@ -288,7 +288,7 @@ def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
     words, off = f"{len(known)} of {len(frames)} frames", 0.0
     if len(true) > 1:
         both = np.array([of.attitude[k] for k in true]), np.array(list(true.values()))
-        # Turns are compared, not attitudes: the sensor's reference is another one than that of the truth.
+        # Turns are compared, not attitudes, whose frames of reference differ.
         turns = (np.swapaxes(R[:-1], 1, 2) @ R[1:] for R in both)
         off = math.degrees(float(np.median(angles_between(*turns))))
         words += f"; between frames it turns {off:.3g} degrees otherwise than truth"
@@ -297,7 +297,7 @@ def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
 
 
 def judge_up(of: Sequence, frames: Frames) -> Finding | None:
-    """Whether the stated vertical can be one."""
+    """Whether the stated vertical is plausible."""
     if of.up is None:
         return None
     known = [v for v in (of.up[k] for k in frames) if v is not None]
@@ -310,20 +310,20 @@ RECORDS = (judge_times, judge_truth, judge_odometry, judge_positions, judge_atti
 
 
 def _length(poses: Poses, known: Iterable[int]) -> float:
-    """Length, m, of the way through the poses of some frames, which have one."""
+    """Length, m, of the path through the poses of the ``known`` frames."""
     places = [T.translation for T in (poses[k] for k in known) if T is not None]
     return sum(float(np.linalg.norm(b - a)) for a, b in pairwise(places))
 
 
-# -- what images, matches and motions show ---------------------------------------------------------------------------
+# -- images, matches and motions -------------------------------------------------------------------------------------
 
 
 def judge_looks(
     looks: Mapping[str, Mapping[int, Look]], names: Series[str], limits: FrameScreeningParams
 ) -> list[Finding]:
-    """Exposure and sharpness of all images, by camera and frame: what ``glance`` of stage ``image_quality`` gives.
+    """Exposure and sharpness of all images; ``looks``: figures of stage ``image_quality`` by camera and frame.
 
-    Blank and blurred are images by the ``limits`` of a run.
+    The ``limits`` of a run decide which images are blank or blurred.
     """
     opened = {camera: of for camera, of in looks.items() if of}
     out = [bad for camera, of in opened.items() for bad in _camera(camera, of, names, limits) if bad.level != "OK"]
@@ -334,7 +334,7 @@ def judge_looks(
         out += [judge("images", line, {"grey": 1}) for line in lines]
     if both and "exposure" not in judged:
         left, right = (_figure({k: opened[camera][k] for k in both}, "mean") for camera in ("left", "right"))
-        # At least one grey level: the ratio of two black images means nothing.
+        # At least one grey level, because the ratio of two black images means nothing.
         ratio = float(np.median(np.maximum(right, 1.0) / np.maximum(left, 1.0)))
         text = f"right is {ratio:.2f} as bright as left, mean grey {np.median([left, right]):.0f}"
         out.append(judge("exposure", text, {"right over left": ratio}))
@@ -375,12 +375,12 @@ def _figure(looks: Mapping[int, Look], name: str) -> Floats:
 
 
 def _usual(values: Floats) -> float:
-    """Median of the finite values; NaN where there is none."""
+    """Median of the finite values; NaN if there is none."""
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else math.nan
 
 
 def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given: bool = False) -> Finding:
-    """Share of usable pixels that are matched, and how far away they lie (m); ``given``: of another program's map."""
+    """Share of matched pixels among the usable ones, and their depths (m); ``given``: of another program's map."""
     share = rate or 0.0
     text, figures = f"{100 * share:.0f} % of the first pair is matched", {"matched": share}
     if given:
@@ -420,7 +420,7 @@ def judge_repetition(share: float) -> Finding:
 
 
 def judge_ground(facts: GroundFacts) -> Finding:
-    """How high the camera stands above the ground of a pair, or why none is seen: facts of stage ``ground_frame``."""
+    """Height of the camera above the ground of a pair, or why no ground is seen (facts of stage ``ground_frame``)."""
     if "warnings" in facts:
         return judge("ground", facts["warnings"][0], {"above": 1})
     if facts["plane"] is None or "no_ground" in facts:
@@ -430,7 +430,7 @@ def judge_ground(facts: GroundFacts) -> Finding:
 
 
 def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:
-    """Whether the right images are of the same moments: facts of :mod:`rille.stages.calibration.synchrony`."""
+    """Whether left and right images are simultaneous (facts of :mod:`rille.stages.calibration.synchrony`)."""
     if "contradiction" in facts:
         return judge("simultaneous", facts["contradiction"], {"contradictions": 1})
     if not facts["rows"]:
@@ -440,7 +440,7 @@ def judge_synchrony(facts: Mapping[str, Any]) -> Finding | None:
 
 
 def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Series[str]) -> Finding:
-    """Overlap of successive left images, of stage ``motion``'s facts."""
+    """Overlap of successive left images (facts of stage ``motion``)."""
     if not motions:
         return judge("motion", "one frame: no trajectory")
     overlap = {k: float(m["overlap"] or 0.0) for k, m in motions.items()}

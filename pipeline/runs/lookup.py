@@ -18,8 +18,8 @@ LEDGER = "ledger.jsonl"
 def all_runs(runs: Path) -> list[Path]:
     """Folders of all runs that have a ledger, in order of time within each sequence."""
     if runs.is_dir():
-        os.scandir(runs).close()  # a folder that is closed raises; glob would find nothing in it
-    # The link `latest` leads to a run that is there already; a pipe would block for ever.
+        os.scandir(runs).close()  # raises if the folder cannot be read, where glob would find nothing
+    # Without the link `latest`, whose run is in the list; a pipe would block for ever.
     return sorted(p.parent for p in runs.glob(f"*/*/{LEDGER}") if p.is_file() and not p.parent.is_symlink())
 
 
@@ -30,15 +30,15 @@ def name(run: Path) -> str:
 
 @contextmanager
 def reading(*runs: Path) -> Iterator[None]:
-    """Say in one line that files of these runs are not as Rille writes them, whatever they hold instead.
+    """Turn errors of reading files of these runs into one line that they are not as Rille writes them.
 
-    A run's folder may come from others, and be damaged or edited on the way. Nothing else belongs within: a fault of
-    the program's own would be told as one of the files.
+    A run's folder may come from others, and be damaged or edited. The context should hold nothing else: faults of the
+    program would be reported as faults of the files.
 
     Raises
     ------
     ConfigError
-        They are not.
+        The files are not as Rille writes them.
     """
     try:
         yield
@@ -65,7 +65,7 @@ def find(text: str, runs: Path) -> Path:
     known = all_runs(runs)
     if text == "latest" and known:
         return max(known, key=lambda run: run.name).resolve()
-    # Paths come before names: a user within another folder of runs means the runs there.
+    # Paths before names: in another folder of runs a user means the runs there.
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()
@@ -73,7 +73,7 @@ def find(text: str, runs: Path) -> Path:
         if text in (run.name, name(run)):
             return run.resolve()
     started = [run for run in known if run.parent.name == text]
-    if started:  # none of them came to its end
+    if started:  # none of them has ended
         return started[-1].resolve()
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
@@ -81,18 +81,18 @@ def find(text: str, runs: Path) -> Path:
 
 
 def elevation(text: str, runs: Path) -> Path:
-    """Path of an elevation model: the file or folder of that name, else the run of that name."""
+    """Path of an elevation model: a file or folder, else the run of this name."""
     path = Path(text)
     if path.is_file() or (path / "dem.tif").exists():
         return path
     try:
         return find(text, runs)
     except ConfigError:
-        return path  # what reads it says what it may be
+        return path  # its reader reports the error
 
 
 def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:
-    """The line of a task in a ledger, as it ended.
+    """The last line of a task in a ledger.
 
     Raises
     ------
@@ -107,12 +107,12 @@ def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]
 
 
 def refuse_unknown(option: str, given: Iterable[str], known: Collection[str], what: str) -> None:
-    """Refuse names that an option does not know.
+    """Refuse unknown names of an option.
 
     Raises
     ------
     ConfigError
-        One of those ``given`` is none of the ``known``; the message has the nearest names, or all.
+        One of the ``given`` names is not ``known``; the message has the nearest names, or all.
     """
     for name in sorted(set(given).difference(known)):
         hint = did_you_mean(name, known) or f"one of {', '.join(sorted(known))}"
@@ -131,7 +131,7 @@ def used(run: Path) -> set[str]:
     Raises
     ------
     ConfigError
-        Its ledger is none, so that this is not known.
+        Its ledger cannot be read.
     """
     with reading(run):
         rows = (row for row in events.read(run / LEDGER) if row["status"] in ("computed", "cached"))

@@ -1,4 +1,4 @@
-"""Options of a run, with their explanation, and those that other commands share; exit codes."""
+"""Options of a run with their explanations, options shared with other commands, exit codes."""
 
 from __future__ import annotations
 
@@ -113,16 +113,16 @@ class Options(Work):
             object.__setattr__(self, "progress", "quiet")
 
     def part(self) -> str:
-        """The options that choose a part of the run, as they are typed; empty: all of it."""
+        """The options that choose a part of the run, as typed; empty: all of it."""
         return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
 
     def command(self, verb: str, *opened: str) -> str:
-        """The command line that repeats a run of a sequence (``Sequence.opened``), as a shell takes it, in one line."""
+        """The command line, for a shell, that repeats a run of a sequence (``Sequence.opened``), in one line."""
         words = ["rille", verb, *opened]
         words += ["--config", str(self.config)] if self.config else []
         words += ["--frames", self.frames] if self.frames else []
         words += [word for a in self.assignments for word in ("--set", a)]
-        # A line feed within a list of TOML is as good as a space; in `config.toml` this is a comment of one line.
+        # In one line, for the comment in `config.toml`; line feeds in lists of TOML may be spaces.
         return plain(f"{shlex.join(words)} {self.part()}".replace("\n", " ").strip())
 
 
@@ -162,7 +162,7 @@ def cache_folder(given: str | Path | None) -> Path:
 
 
 def output_file(output: Path, ending: str) -> Path:
-    """The file with this ending, of an output of several files: its name has no ending, or that of one of them.
+    """The file with this ending of an output of several files, whose name has no ending, or that of one of them.
 
     Raises
     ------
@@ -175,13 +175,13 @@ def output_file(output: Path, ending: str) -> Path:
 
 
 def check_output(path: Path, *endings: str, option: str = "--output", others: Mapping[Path, str] = _NONE) -> None:
-    """Refuse a name that the file to be written cannot have, before anything is computed.
+    """Refuse an impossible name of a file to write, before anything is computed.
 
     Parameters
     ----------
-    path : what ``option`` names.
-    endings : those of which it must have one; none: any.
-    others : what the command reads or writes besides, in words, by its resolved path.
+    path : value of ``option``.
+    endings : permitted endings; none: any.
+    others : other files that the command reads or writes, in words, by their resolved paths.
 
     Raises
     ------
@@ -204,6 +204,6 @@ def check_output(path: Path, *endings: str, option: str = "--output", others: Ma
 
 
 def check_new(path: Path, but: str = "", remedy: str = "give another --output, or remove it") -> None:
-    """Refuse to overwrite a file that may be the user's own work; ``but`` says why it is taken for that."""
+    """Refuse to overwrite a file that may be the user's own work; ``but``: why it may be."""
     if path.exists():
         raise ConfigError("RIL-038", f"{path} exists{but}", remedy=remedy)

@@ -12,7 +12,7 @@ from rille.pipeline.runs.lookup import refuse_unknown
 from rille.stages.core.errors import ConfigError
 
 FLOWS = ("builders", "reconstruction", "assessment")
-"""Modules whose stages a reconstruction is made of."""
+"""Modules that lay out the stages of a reconstruction."""
 
 MADE_BY = {
     "crosscheck_accuracy": "accuracy",
@@ -21,16 +21,16 @@ MADE_BY = {
     "world_risk": "risk",
     "world_path": "path",
 }
-"""Stage of each product that files are made of, where its name is another; what no stage is named by is there early."""
+"""Stage of each product that files are made of, if their names differ; products without a stage are known early."""
 
 
 def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
-    """Return what of a run's graph is wanted; None where that is all of it.
+    """The wanted part of a run's graph; None: all of it.
 
     Parameters
     ----------
     until : names of stages.
-    only : names of files of a run, as :data:`rille.pipeline.export.catalogue.OUTPUTS` has them.
+    only : names of files of a run, see :data:`rille.pipeline.export.catalogue.OUTPUTS`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Folders of runs that use a cache, remembered in the cache: clearing up must keep what any of them refers to."""
+"""Folders of runs that use a cache, noted in the cache, so that garbage collection keeps their artifacts."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ FOLDER = "roots"
 
 
 def note(store: Store, runs: Path) -> None:
-    """Remember a folder of runs, once. Best effort: a cache may be read-only."""
+    """Note a folder of runs, once, if the cache can be written."""
     folder = str(runs.resolve())
-    # By machine and folder: a shared cache has users on several, and each notes itself once.
+    # By machine and folder, since users of a shared cache may be on several machines.
     named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
     path = store.root / FOLDER / f"{named}.json"
     with suppress(OSError):
@@ -28,12 +28,12 @@ def note(store: Store, runs: Path) -> None:
 
 
 def folders(store: Store, runs: Path) -> list[Path]:
-    """``runs`` and all remembered folders; those of this machine that are gone hold no runs.
+    """``runs`` and all noted folders, without those of this machine that are gone.
 
     Raises
     ------
     StoreError
-        Runs of another machine cannot be seen from here, so that their artifacts would count as unused; or a note
+        Runs of another machine cannot be read from here, so that their artifacts would count as unused; or a note
         cannot be read.
     """
     seen = {runs.resolve()}

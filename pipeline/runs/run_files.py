@@ -29,18 +29,18 @@ Made = dict[str, Handle]
 
 
 def lay_out(graph: Graph, view: RunView, made: Made) -> None:
-    """Add the task of each output, to ``made`` too, once it is known what became of all that it reads.
+    """Add the task of each output, to ``made`` too, once the outcome of all tasks that it reads is known.
 
-    They are the last ones of the graph, so whatever else can be computed goes first; an output whose artifacts are
-    there early is made early. Of a part of a run: the files that are wanted, or that read nothing else than it has,
-    and the facts of what it has; no figures.
+    They are the last ones of the graph, so all other tasks go first; an output whose artifacts are there early is made
+    early. A part of a run makes the wanted files, files that read nothing outside of the part, and the facts of the
+    part, but no figures.
     """
     for module in MODULES if graph.cut is None else catalogue.MADE:
         for output in module.OUTPUTS:
             if graph.cut is None or _is_wanted(output, view, graph):
                 graph.flow(_make(graph, view, module, output, made))
     if graph.cut is not None:
-        # Laid out last, when all tasks of the files are known: its facts cover these.
+        # Laid out last, since its facts cover the tasks of all files.
         graph.last = lambda: graph.flow(_make(graph, view, summary, *summary.OUTPUTS, made))
 
 
@@ -52,14 +52,14 @@ def _is_wanted(output: Output, view: RunView, graph: Graph) -> bool:
 
 
 def plan(graph: Graph, view: RunView) -> None:
-    """Add the task of each output that a run would make; ``view`` holds what is known without computing anything."""
+    """Add the task of each output that a run would make; ``view`` is known without a computation."""
     for module in MODULES:
         for output in module.OUTPUTS:
             add(graph, module, output, view)
 
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
-    # Tasks laid out last end last: if one of them is not there, the others need not be looked at.
+    # Last ones first, since tasks laid out last end last.
     read = handles(output, view)[::-1]
     if graph.cut is not None and output.name not in view.only:
         read = [handle for handle in read if handle.index in graph.needed]
@@ -70,7 +70,7 @@ def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made:
 
 
 def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
-    """One row a task, with the seconds that it took whenever it was computed, and one a plan that failed."""
+    """One row for each task, with the seconds of its computation in any run, and one for each flow that failed."""
     rows = []
     for h in graph.nodes:
         before = None if h.ref is None else h.ref.seconds
@@ -83,8 +83,8 @@ def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
 
 
 def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, Any]:
-    """Write all files of a run; what has no artifact is left out; give what ``report.json`` holds."""
-    # Copies, not links: a user may edit or delete any file of a run, and the cache stays whole.
+    """Write all files of a run that have an artifact; return the content of ``report.json``."""
+    # Copies, not links, because a user may edit the files of a run.
     for output in (output for module in catalogue.MADE for output in module.OUTPUTS):
         for name, content in _files(made.get(output.name), store).items():
             atomic.write(folder / name, content)
@@ -101,7 +101,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, An
 
 
 def _files(handle: Handle | None, store: Store) -> dict[str, bytes]:
-    """Content of each file of an output by its name; none where it was not made."""
+    """Content of each file of an output by its name; empty if it was not made."""
     if handle is None or handle.ref is None:
         return {}
     try:

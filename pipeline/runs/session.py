@@ -1,8 +1,8 @@
 """One run from options to a folder of results: open, configure, run the graph, write products and report.
 
-Everything that takes time is a cached task, files and figures among them; each run copies them into its folder
-``RUNS/<sequence>/<run id>/`` and renders the page around them. ``latest`` moves last, and only to a folder that is
-complete or whose holes are named in its report.
+All that takes time is a cached task, files and figures too; each run copies these into its folder
+``RUNS/<sequence>/<run id>/`` and renders the page. ``latest`` moves last, and only to a folder that is complete or
+whose report names its holes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     Raises
     ------
     ConfigError
-        The range is no range, empty, or reaches beyond the sequence.
+        The text is no range, or the range is empty or reaches beyond the sequence.
     """
     remedy = f"give START:STOP[:STEP] within 0:{count}"
     try:
@@ -71,9 +71,9 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
 
 
 def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the user has set, by section: of the sequence, and of the stages."""
+    """The user's settings by section: of the sequence, and of the stages."""
     given = read_toml(options.config, "configuration") if options.config else {}
-    # Over the file: --set is said now, --config may be old.
+    # --set overrides --config.
     return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
 
 
@@ -90,7 +90,7 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
         vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
     if "vehicle" in for_stages:
         source = "user"
-    # What suits the sequence lies beneath; a user's value always wins.
+    # Defaults of the sequence lie beneath the user's values.
     layers = vehicle, configuration.expand(sequence.defaults)
     with within(f"defaults of {sequence.name}"):
         suited = configuration.build(*layers)
@@ -101,7 +101,7 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
 
 
 def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
-    """As :func:`settings`, for a run: refuse what it cannot use; ``warn`` takes what is suspicious but possible."""
+    """As :func:`settings`, for a run: refuse unusable settings; ``warn`` takes warnings about suspicious ones."""
     # Before anything is read or written.
     if options.force:
         refuse_unknown("--force", options.force, configuration.stage_names(), "stage")
@@ -111,11 +111,11 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
     settled = settings(sequence, options)
     sequence, driven = settled.sequence, settled.sequence.simulation is not None
     who = "a drive" if driven else f"a reconstruction of {sequence.name}"
-    # A drive is over ground.
+    # A drive always is over ground.
     nobody = unread.foreign(driven=driven) | ({"terrain.reference"} if driven else set())
     unread.refuse(settled.given, settled.config, nobody, who)
     rig = judge_rig(sequence.rig)
-    # A manifest warns of its baseline itself, with the key to change.
+    # A manifest warns about its baseline itself, with the key to change.
     if rig.level != "OK" and not any("baseline" in line for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, f"{rig.code}: {rig.text}: {rig.remedy}"))
     for line in sequence.warnings:
@@ -130,8 +130,8 @@ def memory_limit(options: Work) -> int | None:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to: its exit code, the folder of the results, and lines for stdout, the closing one first, and
-    for stderr."""
+    """Outcome of a run: its exit code, the folder of the results, and lines for stdout, the closing one first, and for
+    stderr."""
 
     code: int
     folder: Path
@@ -147,7 +147,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class _Opened:
-    """A run that is configured and laid out: ``view`` for the report, ``folder`` for its results."""
+    """A configured and laid out run: ``view`` for the report, ``folder`` for its results."""
 
     options: Options
     view: RunView
@@ -159,7 +159,7 @@ class _Opened:
 
 
 def late(view: RunView, drive: Drive | None, **known: Any) -> RunView:
-    """The view with facts that are known late: among them the frames that a drive has taken."""
+    """The view with facts that are known late, such as the frames that a drive has recorded."""
     if drive is not None:
         known["sequence"], known["frames"] = drive.recorded()
     return replace(view, **known)
@@ -177,10 +177,10 @@ def perform(
 
     Parameters
     ----------
-    sequence : its name or path, or itself, where it is open already.
+    sequence : its name or path, or an open sequence.
     verb : command that asks for the run.
-    kept : list of the workers that a run leaves to the next one; whoever gives it ends them.
-    warn : takes warnings, one line each: those of the input before anything is computed.
+    kept : list that holds the workers after the run, for the next run with the same list; its maker ends them.
+    warn : takes warnings, one line each; those of the input come before anything is computed.
     """
     from rille.pipeline.runs import run_files  # imports matplotlib, which a wrong option should not have to wait for
 
@@ -193,7 +193,7 @@ def perform(
     _point_latest(opened.folder)
     valid = (h.ref for h in opened.graph.nodes if h.ref is not None and h.index not in opened.graph.outdated)
     suspicious = (line for ref in valid for line in ref.meta.get("warnings", ()))
-    # Some follow from several tasks alone; those of the input were said before the run.
+    # Warnings of tasks and of the report (which follow from several tasks); those of the input came before the run.
     for line in dict.fromkeys((*suspicious, *report["warnings"])):
         if line not in opened.view.sequence.warnings:
             warn(line)
@@ -201,7 +201,7 @@ def perform(
 
 
 def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:
-    """What a run came to, in its closing lines; ``missing`` as its report lists it."""
+    """Outcome of a run, with its closing lines; ``missing`` as its report lists it."""
     from rille.pipeline.report.delivery import lacking, left_out
 
     counts, lines, arrived = result.counts, [], True
@@ -210,7 +210,7 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
         lines.append(f"{': '.join(word for word in outcome if word)}  ({len(stops)} stops)")
         arrived = outcome[0] == "goal"
     page = opened.folder / "report.html"
-    # Answers, and what lies outside of the reconstruction, are no loss: the exit code says the same.
+    # Answers of stages, and failures outside of the reconstruction, do not count; nor do they in the exit code.
     lost = lacking(missing)
     lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}")
     if opened.view.part:
@@ -223,7 +223,7 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
         ledger = opened.folder / LEDGER
         complaints.append(f"rille: {counts['failed']} failed, {counts['skipped']} left out; ledger: {ledger}")
     done = result.ok and arrived
-    # A drive that ended early did not come to the tasks that would have read all parameters.
+    # A drive that ended early has not reached the tasks that read some parameters.
     idle = list(_idle(opened)) if done else []
     whole = done and not lost and not idle
     return RunResult(COMPLETE if whole else HOLES, opened.folder, lines, [*complaints, *idle])
@@ -241,7 +241,7 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
     text = header + configuration.to_toml(config, sequence.parameters)
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
-    # After the layout: if it refuses something, no folder is left behind.
+    # After the layout, so that no folder is left if that refuses something.
     folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
     atomic.write(folder / "config.toml", text)
     view = RunView(
@@ -260,7 +260,7 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
 
 
 def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
-    """Bring every task to its artifact; raise the first failure unless the data are its cause and poses are there."""
+    """Run the graph; raise the first failure, unless the data are its cause and there are poses."""
     options, view = opened.options, opened.view
     roots.note(opened.store, options.runs)
     result = driver.run(
@@ -285,16 +285,16 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
 
 
 def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict[str, Any]:
-    """Write everything that the run leaves; give what ``report.json`` holds."""
+    """Write all files of the run; return the content of ``report.json``."""
     from rille.pipeline.report.delivery import lacking
     from rille.pipeline.runs import run_files
 
-    # The folder may go while a run of hours is under way; writing would make one without its first files.
+    # The folder may be removed during the run; writing would make one without its first files.
     if not (opened.folder / "config.toml").exists():
         text = f"{opened.folder} was removed while the run was under way"
         raise RilleError("RIL-740", text, remedy="run again: what was computed is in the cache")
     if made["facts"].ref is None:
-        # Without facts there is no report: the run fails with the error that kept them from being computed.
+        # Without facts there is no report: the run fails with the error that prevented them.
         result.check()
     tasks = run_files.task_rows(opened.graph, result.failures)
     whole = late(opened.view, opened.drive, tasks=tasks, seconds=result.seconds, left_out=result.left_out)
@@ -305,8 +305,8 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
 
 
 def _idle(opened: _Opened) -> Iterator[str]:
-    """Errors of a run that came to its end: a parameter that no task of it read, and stages that it does not have."""
-    # What a part of a run does not read may be meant for the rest.
+    """Errors at the end of a run: parameters that no task read, and stages to force that it does not have."""
+    # Parameters that a part of a run does not read may be for the rest.
     if not opened.view.part and (lost := unread.unread(opened.view.given, opened.view.config, opened.graph)):
         error = unread.error(lost, opened.view.config)
         yield f"rille: error {error.code}: {error}"
@@ -316,7 +316,7 @@ def _idle(opened: _Opened) -> Iterator[str]:
 
 
 def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
-    """New folder named by time and a short digest of the plan."""
+    """Make a folder named by time and a short digest of the plan."""
     latest = parent / "latest"
     if latest.exists() and not latest.is_symlink():
         text = f"{latest} is no link to a run"
@@ -338,11 +338,11 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
 
 def _point_latest(folder: Path) -> None:
     """Move ``latest`` to a finished run in one step."""
-    # symlink_to cannot replace a link; a rename can, in one step, so a reader finds the earlier or the new run.
+    # Unlike symlink_to, a rename replaces the link in one step, so that readers find the earlier or the new run.
     link = folder.parent / f".latest-{uuid.uuid4().hex}"
     try:
         link.symlink_to(folder.name, target_is_directory=True)
         link.replace(folder.parent / "latest")
-    except OSError as error:  # of a file system without links; the results are whole
+    except OSError as error:  # a file system without links; the results are complete
         text = f"{folder.parent / 'latest'} does not lead to this run: {error.strerror}; name it as {folder.name}"
         warn(warning("RIL-741", text))

@@ -1,8 +1,7 @@
-"""The rig that all later stages compute with, without the other facts of stage ``rig``.
+"""The rig that all later stages use, without the other facts of stage ``rig``.
 
-Stage ``rig`` also states how certain the rig is and what each pair contributed; these facts change with every pair that
-is added. Later stages read the rig alone, so their results stay cached as long as the rig itself is the same to the
-bit.
+These facts, such as the uncertainty of the rig and the values of each pair, change with every added pair. Later stages
+read the rig alone, so that their results stay cached as long as no bit of the rig changes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Whether to believe the matches of a pair as a whole.
+"""Whether the matches of a pair, as a whole, are doubtful.
 
-They deserve doubt by two signs, which images show without calibration, each a share of a sample of the matches: those
-far from every epipolar line, as no rigid scene has them; and those that look as well elsewhere along their line, as on
-a repeating pattern, where each match may be off by a period.
+Two shares of a sample of the matches show this without calibration: of matches far from their epipolar lines, which a
+rigid scene does not have; and of matches that correlate as well elsewhere on their lines, as on a repeating pattern,
+where each match may be off by a period.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.hfvm.image import thinned
 
 MIN_MATCHES = 100
-"""Matches that a judgement needs at least."""
+"""Fewest matches that are judged."""
 
 PATCH_RADIUS_PX = 8
 """Pixels: half side of a patch."""
 
 SEARCH_REACH_PX = 64
-"""Pixels: how far from its match a likeness is sought."""
+"""Pixels: largest distance from a match at which a similar patch is searched for."""
 
 MIN_RIGID_SHARE = 0.75
 """Share of matches on their lines below which a pair is doubtful. Right pairs reach .98; one through unrectified lenses
@@ -37,7 +37,7 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def judge(left: AnyArray, right: AnyArray, disparity: Any, matched: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Shares of the matches that lie on their lines, and that look as well elsewhere; None: too few to tell.
+    """Shares of the matches that lie on their lines, and that look as well elsewhere; None: too few matches.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def sample(column: AnyArray, row: AnyArray, matched: NDArray[np.bool_]) -> Place
 
 
 def lines(places: Places) -> NDArray[np.float64] | None:
-    """Fundamental matrix that most matches agree on; None where there is none."""
+    """Fundamental matrix that fits most matches; None if there is none."""
     f, _ = cv2.findFundamentalMat(*places, cv2.USAC_MAGSAC, 0.5 * MAX_LINE_DISTANCE_PX, 0.999, 5000)
     return None if f is None or f.shape != (3, 3) else np.asarray(f, np.float64)
 
@@ -78,7 +78,7 @@ def on_their_lines(places: Places, f: NDArray[np.float64] | None) -> float:
 
 
 def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.float64] | None) -> float:
-    """Share of the matches that look as well elsewhere on their epipolar line; 0 where too few patches say anything.
+    """Share of the matches that look as well elsewhere on their epipolar lines; 0 if too few patches can be judged.
 
     Parameters
     ----------
@@ -96,24 +96,24 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
             for at, size in zip((q, p), b.shape, strict=True)
         )
         j, i = np.ogrid[y0 : y1 + 1, x0 : x1 + 1]
-        # Without lines the row through the match stands in.
+        # Without lines: the row through the match.
         line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
         here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
         away = (j - q) ** 2 + (i - p) ** 2
-        # The match has been rounded, so that its peak may lie beside it.
+        # The match is rounded: its peak may lie beside it.
         beside = away <= 2**2
-        # Nothing but the strip that holds these is correlated, since that takes the time.
+        # To save time only the strip that holds these pixels is correlated.
         strip = tuple(slice(k.min(), k.max() + 1) for k in np.nonzero(here | beside))
         around = b[y0 - PATCH_RADIUS_PX : y1 + PATCH_RADIUS_PX + 1, x0 - PATCH_RADIUS_PX : x1 + PATCH_RADIUS_PX + 1]
         around = around[tuple(slice(s.start, s.stop + 2 * PATCH_RADIUS_PX) for s in strip)]
         score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
         own = float(score[beside[strip]].max())
-        # 0.7: least correlation of a match whose patch says anything.
+        # 0.7: least correlation of a match that can be judged.
         if not np.isfinite(own) or own < 0.7:
             continue
-        # 8 pixels: how far from its match a likeness counts.
+        # 8 pixels: least distance from the match of a similar patch that counts.
         elsewhere = score[(here & (away >= 8**2))[strip]]
-        # 0.05: by how much less than the match a likeness may correlate.
+        # 0.05: largest difference of its correlation from that of the match.
         looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
 

@@ -1,8 +1,8 @@
-"""Whether matches fit the rig better once the coefficients of the lenses, or R between the cameras, are read otherwise.
+"""Whether matches fit the rig better with another reading of the lens coefficients, or of R between the cameras.
 
 Programs write the same numbers in different orders, and under the names of different models. A wrong reading bends
-the epipolar lines by pixels, which no rotation of a camera explains. MATLAB's rotations are transposed: they multiply
-rows.
+the epipolar lines by pixels, which no rotation of a camera explains. MATLAB's rotations are transposed, since they
+multiply row vectors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TRANSPOSED = "it is transposed"
 
 
 def readings(lens: Lens) -> dict[str, Lens]:
-    """Other lenses that the coefficients of one may be those of, by name."""
+    """Other lenses that the coefficients may describe, by the name of the reading."""
     c, found = lens.coefficients, {"the images are free of distortion already": Lens(lens.camera)}
     for model, other in (("radtan", "fisheye"), ("fisheye", "radtan")):
         if lens.model == model and len(c) == 4:
@@ -32,11 +32,11 @@ def readings(lens: Lens) -> dict[str, Lens]:
 
 
 def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPairs]) -> str:
-    """By which reading of the calibration the matches lie nearer to their epipolar lines, in words; empty: by none.
+    """Message on another reading of the calibration that brings the matches to their epipolar lines; empty: none does.
 
     Parameters
     ----------
-    lenses : of the left and the right camera, from whose images the ideal ones of the ``rig`` were made.
+    lenses : of the left and the right camera; with them the images were undistorted to those of the ``rig``.
     pairs : matches in ideal images.
     """
     ideal = {"left": rig.left, "right": rig.right}
@@ -48,7 +48,7 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
         return float(np.nanmedian(np.abs(distances(rig, np.zeros(RIG), *at.values())[0])))
 
     given = off(lenses)
-    # 0.3 px: more than a good calibration leaves.
+    # 0.3 px: a good calibration leaves less.
     if given < 0.3:
         return ""
     other = {side: readings(lens) for side, lens in lenses.items()}
@@ -57,7 +57,7 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
     between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
     both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
     name, least = min(both.items(), key=lambda item: item[1], default=("", given))
-    # Half of it: no reading is so much better by chance.
+    # Half of it: by chance no reading is so much better.
     if least > min(0.5 * given, 0.3):
         return ""
     what = "R between the cameras seems" if name == TRANSPOSED else "the coefficients of the lenses seem"

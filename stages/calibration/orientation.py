@@ -1,8 +1,8 @@
 """Matches of one stereo pair for its relative orientation (paper, section 5.2.2), and how well they fit the given rig.
 
 Dense matches are thinned, because neighbours share their windows and so their errors. Stage ``rig`` reads the thinned
-matches of all pairs. Here a rig whose right camera may turn is fitted to those of one pair: it shows outliers, and the
-residual that no rotation removes.
+matches of all pairs. This stage fits the rotation of the right camera to those of one pair, which shows outliers, and
+the residual that no rotation removes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def thin(column: ArrayLike, row: ArrayLike, usable: Bools, quality: ArrayLike, s
     ----------
     column, row : (rows, cols) disparity, right minus left, pixels.
     usable : (rows, cols) pixels with a measured disparity.
-    quality : (rows, cols) error of matching there and back, pixels; the least counts as best, NaN as worst.
+    quality : (rows, cols) back-matching error, pixels; the least is best, NaN worst.
     samples : number of cells.
     """
     side = max(1, round(math.sqrt(usable.size / samples)))
@@ -53,7 +53,7 @@ def thin(column: ArrayLike, row: ArrayLike, usable: Bools, quality: ArrayLike, s
 
 
 def _best_of_cells(usable: Bools, quality: Floats, side: int) -> tuple[Floats, Floats]:
-    """Row and column of the usable pixel of least error in each cell that has one, the first of equals; in order."""
+    """Row and column of the first usable pixel of least error in each cell that has one, in order of the cells."""
     known = np.where(np.isnan(quality), np.finfo(np.float32).max, quality)
     rest = [(0, -n % side) for n in usable.shape]
     error = np.pad(np.where(usable, known, np.inf), rest, constant_values=np.inf)
@@ -65,7 +65,7 @@ def _best_of_cells(usable: Bools, quality: Floats, side: int) -> tuple[Floats, F
 
 
 def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
-    """Robust weights (n,) of one pair's matches, 0 of an outlier, and the pair's facts."""
+    """Robust weights (n,) of one pair's matches, 0 for outliers, and the pair's facts."""
     count = len(matches.left)
     facts: OrientationFacts = {"pair": matches.pair, "matches": count}
     if count < MIN_MATCHES:
@@ -97,17 +97,17 @@ def orientation_stage(
 ) -> Bundle[OrientationFacts]:
     """Thinned matches of one pair, how well they fit the given rig, and whether its ``left`` and ``right`` images show
     what repeats."""
-    # On planes of textureless regions row displacements were set, not measured.
+    # Excludes planes of textureless regions, whose row displacements are set, not measured.
     usable = matched_back(np.asarray(disparity["validity"]), np.asarray(disparity["backmatch_error"]))
     rig.check(usable.shape)
     places = thin(
         disparity["column_disparity"], disparity["row_disparity"], usable, disparity["backmatch_error"], params.samples
     )
-    # rounded to float32, as stage rig will read them
+    # Rounded to float32, as stage rig reads them.
     points = dict(zip(("left", "right"), (one.astype(np.float32) for one in places), strict=True))
     matches = PointPairs(pair, points["left"].astype(np.float64), points["right"].astype(np.float64))
     weight, facts = orient(rig, matches)
-    # A fundamental matrix has seven freedoms.
+    # A fundamental matrix has seven degrees of freedom.
     f = lines((matches.left, matches.right)) if len(matches.left) > 7 else None
     facts["repeated"] = repeated(left["image"], right["image"], (matches.left, matches.right), f)
     return Bundle(points | {"weight": weight.astype(np.float32)}, facts)

@@ -4,12 +4,12 @@ A low epipolar residual does not prove that the rig is right: toe-in of a parall
 that is a few pixels off, and a fit that frees the toe-in lowers the residual at the price of wrong depth. So a
 parameter is freed only if
 
-1. it is *observed*: with every other error estimated, too (:mod:`rille.stages.calibration.relative_orientation`), its
-   remaining uncertainty changes depth little; or matches beyond infinity show that depth is wrong, and the parameter
-   explains them;
+1. it is *observed*: its uncertainty, with every other error estimated too
+   (:mod:`rille.stages.calibration.relative_orientation`), changes depth little; or matches beyond infinity show that
+   depth is wrong, and the parameter explains them;
 2. it is *contradicted*: it differs from the calibration by several of its standard deviations, and a wrong principal
-   point is not the likelier cause. The principal point is the likelier cause if a single angle departs alone. Where one
-   angle departs, the camera was turned, and of the other angles one standard deviation is enough;
+   point is not the likelier cause, as it is if a single angle departs. If an angle departs, the camera was turned, and
+   for the other angles one standard deviation is enough;
 3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration, or another
    angle departs and this one contradicts its calibration, too.
 
@@ -46,12 +46,12 @@ from rille.stages.geometry.geometry import Rig
 ANGLES = 3
 
 BEYOND_SHARE = 0.1
-"""Share of matches more than a pixel beyond infinity from which on depth is wrong; a sky has fewer."""
+"""Share of matches more than a pixel beyond infinity above which depth is wrong; a sky has fewer."""
 
 
 SYSTEMATIC_PX = 0.1
-"""Smooth row error [pixels RMS over the image] that no rig explains and more matches do not reduce: remains of lens
-model and rectification."""
+"""Smooth row error [pixels RMS over the image] of lens model and rectification, which no rig explains and more matches
+do not reduce."""
 
 MAX_DEPTH_ERROR = 0.03
 """Largest relative depth error that the uncertainty of an observed parameter may cause; a wrong toe-in of a parallel
@@ -98,8 +98,8 @@ class RelativeParams(Params):
 class Parameter:
     """One parameter of the rig: its correction and sigma (radians), whether it was freed, and why or why not.
 
-    ``value`` is what is applied: 0 where held. ``asked`` is what the images alone ask for, ``sigma`` the error of that
-    figure: the error of ``value``, if it is free.
+    ``value`` is the applied correction, 0 if held; ``asked`` the estimate from the images alone. ``sigma`` is the error
+    of ``value`` if freed, else of ``asked``.
     """
 
     name: str
@@ -118,7 +118,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision about each parameter of a rig.
+    """Correction of a rig, and the decision about each of its parameters.
 
     Attributes
     ----------
@@ -146,10 +146,10 @@ def decide(rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> Dec
     return _Chooser(rig, pairs, params).decision()
 
 
-class _Asked(NamedTuple):
-    """What the images ask of a parameter that is freed beside the chosen ones, cameras as given.
+class _Estimate(NamedTuple):
+    """A parameter as estimated from the images with the chosen ones, cameras as given.
 
-    ``value``, ``sigma``: radians; ``rows``, ``depth``: what that does to rows, pixels RMS, and to depth, relative.
+    ``value``, ``sigma``: radians; ``rows``, ``depth``: its effect on rows, pixels RMS, and on depth, relative.
     """
 
     value: float
@@ -162,12 +162,12 @@ class _Asked(NamedTuple):
 
 
 class _Chooser:
-    """Chooses on the quadratic that a fit with everything free leaves, then fits once more with the chosen."""
+    """Chooses parameters by the normal equations of a fit with all of them free, then fits the chosen ones alone."""
 
     def __init__(self, rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> None:
         self.rig, self.pairs, self.params, self.priors = rig, pairs, params, params.priors(rig)
         self.all = adjust(rig, pairs, [True] * RIG, self.priors, rival=True)
-        # Sensitivities at the rig that the images ask for: a wrong toe-in would state them for wrong depths.
+        # Sensitivities at the fitted rig: with a wrong toe-in they would be those of wrong depths.
         near = corrected(rig, self.all.x[:RIG])
         self.depth = np.mean([depth_sensitivity(near, m.left, m.right) for m in pairs], axis=0)
         self.impossible = impossible_share(rig, pairs, self.all) > BEYOND_SHARE
@@ -175,7 +175,7 @@ class _Chooser:
 
     def decision(self) -> Decision:
         chosen: list[int] = []
-        for _ in range(3):  # a later parameter may make an earlier one unnecessary, and the other way round
+        for _ in range(3):  # each choice may make others unnecessary, or possible
             before = sorted(chosen)
             self._add(chosen, range(ANGLES))
             self._add(chosen, range(ANGLES, RIG))
@@ -186,7 +186,7 @@ class _Chooser:
             if sorted(chosen) == before:
                 break
         fit, correction = self._settled(chosen)
-        if chosen and not self._worth(correction):  # changes that were worth it singly may cancel each other
+        if chosen and not self._worth(correction):  # changes that are large enough singly may cancel each other
             chosen = []
             fit, correction = self._settled(chosen)
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
@@ -199,7 +199,7 @@ class _Chooser:
         return fit, np.where(free, fit.x[:RIG], 0.0)
 
     def _moves(self, correction: Floats) -> tuple[float, float]:
-        """What a correction (5,), radians, does to the rows, pixels RMS, and to depth, relative."""
+        """Effect of a correction (5,), radians, on rows, pixels RMS, and on depth, relative."""
         rows, depth = (math.sqrt(float(correction @ form @ correction)) for form in (self.rows, self.depth))
         return rows, depth
 
@@ -211,13 +211,13 @@ class _Chooser:
     def _explains(self, correction: Floats) -> bool:
         """Whether many matches lie beyond infinity, so that depth is surely wrong, and a correction (5,) explains them.
 
-        Noise that matches in a sky lies there with any.
+        Chance matches in a sky lie there with every correction.
         """
         # 0.03: largest share of matches beyond infinity that may remain after a correction that explains the others.
         return self.impossible and impossible_share(corrected(self.rig, correction), self.pairs, self.all) < 0.03
 
     def _add(self, chosen: list[int], group: Sequence[int]) -> None:
-        """Take up what the images change most, one after the other."""
+        """Choose the parameters that are not refused, one after the other, each the one of most gain."""
         while True:
             able = [i for i in group if i not in chosen and self._refusal(i, chosen) is None]
             if not able:
@@ -231,12 +231,12 @@ class _Chooser:
         return self._solve([*chosen, i], rival=False)[2]
 
     def _depth_error(self, i: int, chosen: list[int]) -> float:
-        """Relative depth error that a parameter's uncertainty makes, principal point unknown."""
+        """Relative depth error by a parameter's uncertainty, with the principal point unknown."""
         covariance = self._solve([*chosen, i], rival=True)[1]
         return math.sqrt(float(self.depth[i, i] * covariance[i, i]))
 
     def _knocked(self, i: int, chosen: list[int]) -> bool:
-        """Whether it was a turn: other angles changed, too, or the principal point cannot have made the difference."""
+        """Whether the camera was turned: another angle changed too, or no principal point explains the difference."""
         if self.impossible or self._turned(i, chosen):
             return True
         x, covariance, _ = self._solve([*chosen, i], rival=True)
@@ -251,10 +251,10 @@ class _Chooser:
         x, _, _ = self._solve([*chosen, i], rival=False)
         return self._explains(np.where(np.isin(np.arange(RIG), [*chosen, i]), x[:RIG], 0.0))
 
-    def _asked(self, i: int, chosen: list[int]) -> _Asked:
+    def _asked(self, i: int, chosen: list[int]) -> _Estimate:
         x, covariance, _ = self._solve([*chosen, i], rival=False)
         value = float(x[i])
-        return _Asked(value, math.sqrt(float(covariance[i, i])), *self._moves(value * np.eye(RIG)[i]))
+        return _Estimate(value, math.sqrt(float(covariance[i, i])), *self._moves(value * np.eye(RIG)[i]))
 
     def _refusal(self, i: int, chosen: list[int]) -> str | None:
         """Why a parameter is held; None where it is to be freed."""
@@ -266,7 +266,7 @@ class _Chooser:
                 f"{100 * error:.1f} % of depth would stay unknown; taken alone the images ask for {asked}, "
                 f"which is {100 * asked.depth:.1f} % of depth"
             )
-        # Of a rig that was turned nothing says that its other angles are those of the calibration.
+        # A turned camera hardly keeps its other angles.
         turned = i < ANGLES and self._turned(i, chosen)
         contradicted = abs(asked.value) >= self.params.significance * asked.sigma
         if not contradicted and not (turned and abs(asked.value) >= asked.sigma):
@@ -276,7 +276,7 @@ class _Chooser:
                 f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
                 f"say {asked}, which is {100 * asked.depth:.1f} % of depth"
             )
-        # Held, a small turn that is certain would pass into the other angles.
+        # A small but certain turn, if held, would pass into the other angles.
         small = asked.rows < self.params.least_rows and asked.depth < MIN_DEPTH_CHANGE
         if small and not (turned and contradicted):
             moves = f"rows by {asked.rows:.2f} px, depth by {asked.depth:.2%}"
@@ -285,7 +285,7 @@ class _Chooser:
 
     def _held(self, chosen: list[int]) -> Floats:
         """Standard deviations (5,) of the held parameters, radians: their prior, or less if the images show less."""
-        # Root of value squared and sigma squared: the images show how far it may be out, their own error included.
+        # Root of value squared and sigma squared: how far it may be off by the images, their error included.
         shown = [self._asked(i, chosen) for i in range(RIG)]
         return np.minimum(self.priors.held(), [math.hypot(one.value, one.sigma) for one in shown])
 
@@ -313,6 +313,6 @@ def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit)
 
 
 def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:
-    """Mean square (5, 5), as a quadratic form, of the pixels that matches move across their lines by a correction."""
+    """Quadratic form (5, 5): mean square pixels by which a correction moves matches across their lines."""
     by_radian = [distances(rig, np.zeros(RIG), m.left, m.right)[1][:, :RIG] for m in pairs]
     return np.asarray(np.mean([d.T @ d / len(d) for d in by_radian], axis=0), dtype=np.float64)

@@ -1,16 +1,16 @@
 """Robust adjustment of a rig to correspondences of one or several pairs, together with errors that no rig explains.
 
-Beside the five parameters of the rig (:mod:`rille.stages.geometry.epipolar`) the images hold errors that no number of
-matches averages out, and a fit without them claims a precision it does not have. They are estimated with a prior and
-then dropped:
+Besides the five parameters of the rig (:mod:`rille.stages.geometry.epipolar`) two errors determine the distances of
+matches from their lines; no number of matches averages them out, and a fit without them claims too high a precision.
+They are estimated with a prior and then dropped:
 
-* ``principal``: the right principal point is off, and the calibration's rotation made up for it, so that the disparity
-  at infinity is right. On a parallel rig its rows look like toe-in, though the depth is right: without it a fit
-  "repairs" the toe-in of a sound calibration. Only a rig that converges (or a wide angle) can tell the two apart;
-* ``smooth``: a low polynomial of the row over the image: what lens model and rectification leave.
+* ``principal``: the right principal point is off, and the calibration's rotation compensates it, so that the disparity
+  at infinity is right. On a parallel rig its row errors look like toe-in, though the depth is right: without it a fit
+  "repairs" the toe-in of a sound calibration. Only a convergent rig (or a wide angle) can tell the two apart;
+* ``smooth``: the row error of lens model and rectification, a polynomial of low degree over the image.
 
 Both are the same in all pairs. The noise of the matches is measured, pair by pair, with its correlation between
-neighbours. Weights are Tukey's, narrowed from the scatter about the given rig.
+neighbours. Weights are Tukey's; their scale starts at the scatter about the given rig and only decreases.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i))
 SIZE = RIG + PRINCIPAL + len(TERMS)
 
 PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
-"""Angles, and the coordinate of the principal point that looks like each."""
+"""Each angle with the coordinate of the principal point that has a similar effect."""
 
 MIN_MATCHES = 50
 
 BLOCKS = 6
-"""Blocks along either side of the image whose means show how far errors of neighbours go together."""
+"""Blocks along either side of the image; the scatter of their means shows how far errors of neighbours correlate."""
 MIN_MATCHES_OF_BLOCK = 5
-"""Fewest matches of a block that have a mean, or a median, to speak of."""
+"""Fewest matches of a block whose mean, or median, is used."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class OrientationFit:
 
 @dataclass(frozen=True)
 class Linear:
-    """Distances ``constant + design @ x`` (n,) of one pair, to first order about ``about``; the matches' blocks."""
+    """Distances ``constant + design @ x`` (n,) of one pair, linear about ``about``; ``block`` (n,) of each match."""
 
     constant: Floats
     design: Floats
@@ -121,12 +121,12 @@ def adjust(
     *,
     rival: bool,
 ) -> OrientationFit:
-    """Adjust a rig to point pairs, together with the errors of the images that no rig explains.
+    """Adjust a rig to point pairs, together with the errors that no rig explains.
 
     Parameters
     ----------
     free : which of the five parameters of the rig have no prior. The others have the prior of an intact calibration
-        (``priors``), so that they take up their part of the residuals and the free ones do not.
+        (``priors``), so that their part of the residuals does not pass into the free ones.
     rival : see :func:`precision`.
     """
     return _adjust(rig, pairs, precision(free, priors, rival=rival))
@@ -135,11 +135,10 @@ def adjust(
 def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors) -> OrientationFit:
     """Fit the free parameters so that the residuals of the resulting rig are smallest.
 
-    The other parameters are fixed at their given values, and the smooth error is not estimated. Neither may take up a
-    part of the residuals here, because in the resulting rig the others are as given and the smooth error remains.
+    The other parameters are fixed at their given values, and the smooth error at zero, because the resulting rig
+    corrects neither.
     """
-    # A smooth error that is as good as held at none.
-    # 1e-7: standard deviation [rad] of a parameter that is held exactly.
+    # 1e-7: standard deviation [rad] that holds a parameter; 3e-3 [px]: one that practically holds the smooth error.
     none = replace(priors, rotation=1e-7, baseline=1e-7, systematic=3e-3)
     return _adjust(rig, pairs, precision(free, none, rival=False))
 
@@ -153,7 +152,7 @@ def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Prior
     """
     prior = precision(free, priors, rival=False)
     for i in np.flatnonzero(~np.asarray(free)):
-        # By the standard deviations that they are known to have now, not by the priors of the fit.
+        # Their standard deviations as known by now, not the priors of the fit.
         prior[i, i] = held[i] ** -2.0
     solved = np.array([*free, *[True] * PRINCIPAL, *[False] * len(TERMS)])
     inverse = np.linalg.inv(fit.normal[np.ix_(solved, solved)] + prior[np.ix_(solved, solved)])
@@ -168,8 +167,7 @@ def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> Orientation
     """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
     x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
     for _ in range(30):
-        # All pairs are linearised about the same x: look at the first. Within a milliradian
-        # the derivatives neglect less than 0.001 pixels.
+        # All pairs are linearised about the same x. Within a milliradian the derivatives neglect less than .001 pixels.
         if np.abs(x - linear[0].about)[:RIG].max() > 1e-3:
             linear = linearised(rig, pairs, x)
         parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
@@ -187,21 +185,23 @@ def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> Orientation
 def precision(free: Sequence[bool], priors: Priors, *, rival: bool) -> Floats:
     """The priors' part (SIZE, SIZE) of the normal matrix.
 
-    ``rival``: a principal point that is off may stand in for a free angle, as it always may for a held one. With it,
-    what is knowable shows; without it, the angle takes all (lenses stay on their cameras when a mount turns).
+    ``rival``: a wrong principal point may explain the residuals instead of a free angle, as it always may instead of a
+    held one. With it the errors say what is knowable; without it the angle explains all (when a mount turns, lenses
+    stay on their cameras).
     """
     sigma = np.concatenate([priors.held(), priors.principal, np.full(len(TERMS), priors.term)], dtype=np.float64)
-    # Free means: anywhere within a radian, which keeps the matrix regular where a scene says nothing at all.
+    # Free: a prior of one radian, which keeps the matrix regular where a scene does not determine the parameter.
     sigma[:RIG] = np.where(np.asarray(free), 1.0, sigma[:RIG])
     for angle, coordinate in PARTNERS:
         if free[angle] and not rival:
-            # As good as held as given.
+            # Practically held.
             sigma[RIG + coordinate] = 1e-3
     return np.diag(sigma**-2.0)
 
 
 def solution(fit: OrientationFit, free: Sequence[bool], priors: Priors, *, rival: bool) -> tuple[Floats, Floats, float]:
-    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's quadratic for another choice."""
+    """Values (SIZE,), covariance and gain (half the drop of chi-square) of a fit's normal equations with other free
+    parameters."""
     total = fit.normal + precision(free, priors, rival=rival)
     covariance = np.asarray(np.linalg.inv(total), dtype=np.float64)
     x = covariance @ fit.pull
@@ -220,9 +220,9 @@ def _linear(rig: Rig, matches: PointPairs, x: Floats) -> Linear:
     """Distances of a corrected rig with systematic errors about ``x``."""
     distance, slopes = distances(rig, x[:RIG], matches.left, matches.right)
     by_rig, by_point = slopes[:, :RIG], slopes[:, RIG:]
-    # A principal point further right (down) by a pixel, its rotation made up for by yaw (pitch).
-    made_up = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
-    shifts = made_up - by_point
+    # A principal point further right (down) by a pixel, compensated by yaw (pitch).
+    compensation = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
+    shifts = compensation - by_point
     design = np.column_stack([by_rig, shifts, _smooth_terms(rig, matches)])
     column, row = np.minimum(matches.left.T * BLOCKS / [[rig.left.width], [rig.left.height]], BLOCKS - 1).astype(int)
     return Linear(distance - by_rig @ x[:RIG], design, x, row * BLOCKS + column)
@@ -231,15 +231,15 @@ def _linear(rig: Rig, matches: PointPairs, x: Floats) -> Linear:
 def _pair(linear: Linear, last: float, x: Floats) -> _Part:
     """One pair's part of the normal equations, with weights from its own scatter (at most ``last``, pixels)."""
     rest = linear.constant + linear.design @ x
-    # At most the last scale: weights only narrow, so that the fit cannot swing between two sets of inliers.
+    # At most the last scale, so that the fit cannot alternate between two sets of inliers.
     noise = max(0.02, min(last, mad_sigma(rest, 0.0)))
     weights = np.asarray(bisquare(rest / (TUKEY_BISQUARE * noise)), dtype=np.float64)
-    # Errors of neighbours go together: means of blocks scatter by more than the matches in them explain.
+    # Errors of neighbours correlate: means of blocks scatter more than those of independent errors would.
     number = np.bincount(linear.block, weights, BLOCKS**2)
     sums = np.bincount(linear.block, weights * rest, BLOCKS**2)
     used = number >= MIN_MATCHES_OF_BLOCK
-    together = float(np.mean(sums[used] ** 2 / number[used])) / noise**2 if used.any() else 1.0
-    weighted = linear.design.T * (weights / (noise**2 * max(1.0, together)))
+    inflation = float(np.mean(sums[used] ** 2 / number[used])) / noise**2 if used.any() else 1.0
+    weighted = linear.design.T * (weights / (noise**2 * max(1.0, inflation)))
     return _Part(weighted @ linear.design, -weighted @ linear.constant, noise, weights)
 
 
@@ -252,6 +252,6 @@ def _smooth_terms(rig: Rig, matches: PointPairs) -> Floats:
 
 
 def rms(distance: Floats, weights: Floats) -> float:
-    """RMS of the distances that are no outliers, pixels; NaN where all are."""
+    """RMS of the distances without outliers, pixels; NaN if all are outliers."""
     used = weights > 0
     return float(np.sqrt(np.mean(distance[used] ** 2))) if used.any() else float("nan")

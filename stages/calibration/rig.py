@@ -1,8 +1,8 @@
 """The rig that a run reconstructs with: the given calibration, repaired only where the images contradict it.
 
 The relative orientation enters every later stage through this one artifact (paper, section 5.2.2: relative orientation
-with the baseline's length held fixed). The correspondences of all pairs are pooled; what they do not observe, do not
-contradict, or would change by too little to matter stays as given, to the last bit
+with the baseline's length held fixed). The correspondences of all pairs are pooled; parameters that they do not
+observe, do not contradict, or would hardly change stay as given, to the last bit
 (:mod:`rille.stages.calibration.parameter_selection`).
 """
 
@@ -70,10 +70,10 @@ class RigParams(RelativeParams):
 def orient_rig(
     given: Rig, pairs: Sequence[PointPairs], params: RigParams, first: Rig | None = None, repeated: float = 0.0
 ) -> RigFacts:
-    """Facts of the rig to be used; without a pair that can be used, only the first six and ``warnings``.
+    """Facts of the rig to be used; without a usable pair only the first six and ``warnings``.
 
-    ``first``: as it was given, where the tracks have corrected its cameras or its yaw since; ``repeated``: share of the
-    matches that look as well elsewhere.
+    ``first``: the rig as it was given, if the tracks have corrected its cameras or its yaw since; ``repeated``: share
+    of the matches that look as well elsewhere.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def orient_rig(
         repeats = repeated > MAX_REPEATED_SHARE
         facts |= cast(RigFacts, _judged(given, _share(usable), params, shown, repeats=repeats))
         if repeats:
-            # Matches that are off by a period contradict a right calibration, or lie beyond infinity.
+            # Matches that are off by a period may contradict a right calibration, or lie beyond infinity.
             facts["repeats"] = (
                 f"{repeated:.0%} of the matches look as well elsewhere on their epipolar lines: on a pattern that "
                 "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses"
@@ -116,13 +116,12 @@ def orient_rig(
 
 
 def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, *, repeats: bool) -> dict[str, Any]:
-    """What the pairs say on the given rig, and the rig that follows; ``shown``: its angle that tracks tell;
-    ``repeats``: the pairs show what repeats, and repair nothing."""
+    """Facts of the rig and of its fit to the pairs; ``shown``: angle that the tracks determine; ``repeats``: the pairs
+    show a repeating pattern, and repair nothing."""
     decision = decide(given, pairs, params)
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
-    # 5.0: largest correction [degrees] of each parameter: a mount that was knocked turns by less, and so does a
-    # baseline.
+    # 5.0: largest correction [degrees] of a parameter; a knocked mount, or its baseline, turns by less.
     far = turned or any(abs(math.degrees(p.value)) > 5.0 for p in decision.parameters)
     applied = params.mode != "fixed" and decision.changed and not far and not repeats
     rig = corrected(given, decision.correction) if applied else given
@@ -132,7 +131,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     if (share > BEYOND_SHARE or far) and not turned:
         refuse_impossible(rig, left, right, share)
     elif applied:
-        # What mirrored images ask for may look like a knock.
+        # The correction that mirrored images ask for may look like a knock.
         refuse_mirrored(given, left, right)
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
@@ -146,13 +145,13 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
         words = f"the right images are turned by {abs(turn):.0f} degrees {'anti' if turn < 0 else ''}clockwise"
         warnings = [f"{words} against the left ones, which the calibration does not say: turn them back"]
     marks: dict[str, Any] = {"contradiction": warnings[0]} if far else {}
-    # A pixel of the coarser image is left after the repair: RMS of all pairs, lens distortion or a wrong calibration;
-    # spread of one, its images may be of two moments.
+    # A pixel of the coarser image. A larger RMS of all pairs after the repair: lens distortion or a wrong calibration;
+    # a larger spread of one pair: its images may be of two moments.
     bad_rows = right_pixels(given)
     suspects = [m.pair for m, d in zip(pairs, off, strict=True) if far or mad_sigma(d) > bad_rows]
     marks |= {"suspects": suspects} if suspects else {}
     warnings += [] if turned or repeats else _doubts(share, after, bad_rows)
-    # Beside a calibration of other images the differences between pairs say nothing.
+    # With a calibration of other cameras differences between pairs mean nothing.
     moves = [] if far else _drift(linearised(given, pairs), per_pair, params)
     warnings += [move.warning for move in moves]
     largest = max(moves, key=lambda move: move.rows, default=None)
@@ -173,15 +172,15 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
 
 
 def _share(pairs: list[PointPairs]) -> list[PointPairs]:
-    """Every so manieth match of each pair, so that many pairs together stay affordable."""
-    # With more than 10 000 matches systematic errors dominate; 200 of a pair count at least.
+    """Every n-th match of each pair, so that many pairs together stay affordable."""
+    # Beyond 10 000 matches systematic errors dominate; at least 200 of a pair are used.
     most = max(200, 10_000 // len(pairs))
     steps = [max(1, math.ceil(len(m.left) / most)) for m in pairs]
     return [PointPairs(m.pair, m.left[::s], m.right[::s]) for m, s in zip(pairs, steps, strict=True)]
 
 
 def _alone(given: Rig, matches: PointPairs, decision: Decision, params: RigParams) -> dict[str, Any]:
-    """One pair's own values and sigmas, degrees, of all that the sequence observes."""
+    """One pair's own values and sigmas, degrees, of all parameters that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
     priors = params.priors(given)
@@ -204,7 +203,7 @@ def _word(p: Parameter) -> str:
 
 
 def _off(p: Parameter) -> str:
-    """By how much a parameter is off, in words; of turned images the linear estimate is no angle."""
+    """By how much a parameter is off, in words; for turned images the linear estimate is not an angle."""
     if abs(p.value) < math.radians(MAX_IMAGE_TURN_DEG):
         return f"{_word(p)} is off by {math.degrees(p.value):+.2f} +- {math.degrees(p.sigma):.2f} degrees"
     turned = "" if p.name == "baseline_forward" else " (are the images of both cameras turned?)"
@@ -220,7 +219,7 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
-    # The offset already states the angle that causes it.
+    # The offset stands for the angle that causes it, which is not repeated.
     if standing(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:
@@ -228,7 +227,7 @@ def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     parts = [f"{lines} of the right image lie {abs(offset):.2f} px too {where}"]
     for p in decision.parameters:
         degrees = math.degrees(p.value)
-        # Positive roll turns x (right) to y (down), which is clockwise as one sees the image.
+        # Positive roll turns x (right) to y (down): clockwise in the image.
         if p.freed and p.name == "roll":
             parts.append(f"it is turned by {abs(degrees):.2f} degrees {'' if degrees > 0 else 'anti'}clockwise")
         elif p.freed and p.name != told:
@@ -237,13 +236,13 @@ def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
 
 
 def _contradiction(given: Rig, offset: float, decision: Decision, done: str, hidden: Sequence[Parameter]) -> list[str]:
-    """What a user should know of a calibration that the images contradict.
+    """Warnings about a calibration that the images contradict; empty if they do not.
 
     Parameters
     ----------
     offset : median distance of the matches from their epipolar lines, pixels.
-    done : what became of it.
-    hidden : parameters that nothing shows.
+    done : consequence, in words: repaired, or why not.
+    hidden : parameters that nothing determines.
     """
     if not decision.changed:
         return []
@@ -259,7 +258,8 @@ def _contradiction(given: Rig, offset: float, decision: Decision, done: str, hid
 
 
 def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
-    """Signs that something other than the rig's orientation is wrong: a residual above ``bad_rows``, pixels, say."""
+    """Warnings that something other than the rig's orientation is wrong: a ``residual`` above ``bad_rows``, pixels, or
+    a ``share`` of matches beyond infinity."""
     lines = []
     if residual > bad_rows:
         lines.append(
@@ -272,7 +272,7 @@ def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
 
 
 class _Move(NamedTuple):
-    """A parameter that changes from pair to pair: in words, as a warning, and the most rows it moves, pixels."""
+    """A parameter that changes from pair to pair: in words, as a warning, and its largest row shift, pixels."""
 
     what: str
     warning: str
@@ -282,23 +282,23 @@ class _Move(NamedTuple):
 def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigParams) -> list[_Move]:
     """Parameters that change from pair to pair by more than their errors, in pairs whose rows move enough to matter.
 
-    Over one scene parameters stand in for each other (a pitch for a baseline across, over flat ground), so it counts by
-    how much all that changed moves the rows together; and a rig that moves does so all over the image, mismatches on
-    one thing in view do not, so it counts by how much the blocks of the image show (:func:`_shown`).
+    In one scene the effects of parameters are alike (of a pitch and of a baseline across, over flat ground), so the row
+    shift of all changes together decides. And a rig that moves shifts rows all over the image, mismatches on one object
+    do not, so the shift is measured by blocks of the image (:func:`_row_shifts`).
     """
     names = list(per_pair[0]["values"]) if len(per_pair) > 2 else []
     values = np.array([[p["values"][name] for name in names] for p in per_pair])
     sigma = np.array([[p["sigma"][name] for name in names] for p in per_pair])
-    # of two states of the rig one, not the mean
+    # "lower": one of two states of the rig, not their mean.
     usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
     departure = values - usual
-    moved = _shown(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
+    moved = _row_shifts(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
     moves = []
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
         odd = (away > params.significance * sigma[:, k]) & (moved > params.least_rows)
         if odd.any():
-            # Which of two states is the odd one does not tell when it changed.
+            # The first pair whose state differs from that of pair 0, whichever of the two is the usual one.
             change, degrees = per_pair[int(np.argmax(odd != odd[0]))]["pair"], away[odd].max()
             what = f"the rig moved at pair {change}: {name.replace('_', ' ')} by {degrees:.2f} degrees"
             warning = (
@@ -309,17 +309,17 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     return moves
 
 
-def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:
-    """How far (pairs,) the rows of each pair moved against the others', pixels: the median over blocks of the image.
+def _row_shifts(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:
+    """Row shifts (pairs,) of each pair against the others, pixels: medians over blocks of the image.
 
-    A block moved by what its median row error, beyond what the pairs' own parameters usually leave there, departs from
-    none, as far as the pair's own parameters claim so. Medians, of matches and of blocks: neither a part of a block's
-    matches nor less than half of the blocks, however wrong, moves a rig.
+    The shift of a block is its median row error, less the median over pairs of the error that their own parameters
+    leave there; it counts in the direction, and up to the size, of the shift by the pair's own parameters. With medians
+    of matches and of blocks, neither less than half of a block's matches nor less than half of the blocks move a rig.
 
     Parameters
     ----------
     columns : of the design, those of the parameters.
-    usual, departure : (parameters,) of all pairs and (pairs, parameters) of each against them, radians.
+    usual, departure : parameters (parameters,) of all pairs, and differences (pairs, parameters) from them, radians.
     """
     blocks, medians = np.arange(BLOCKS**2), list[list[Floats]]()
     for one, by in zip(start, departure, strict=True):
@@ -333,7 +333,7 @@ def _shown(start: Sequence[Linear], columns: list[int], usual: Floats, departure
     for k, (found, wanted, _) in enumerate(medians):
         seen = np.isfinite(found)
         if seen.any():
-            # What the block moved by in the direction that the parameters claim, at most as far as they claim.
+            # Shift in the direction of that by the parameters, at most as large.
             apart = (found[seen] - np.nanmedian(left[:, seen], axis=0)) * np.sign(wanted[seen])
             moved[k] = np.median(np.clip(apart, 0.0, np.abs(wanted[seen])))
     return moved

@@ -1,7 +1,7 @@
-"""Test whether left and right images are simultaneous: of some right images, find the one that fits each left one.
+"""Test whether left and right images are simultaneous: find the right image that fits each left one.
 
-While the vehicle moves, matches of a right image of another time lie pixels off their epipolar lines; those of the
-simultaneous image do not. At rest all fit equally, and no finding results.
+While the vehicle moves, matches in a right image of another time lie pixels off their epipolar lines; those in the
+simultaneous image do not. At rest all fit equally, and nothing is reported.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
 
 MIN_SPREAD_PX = 1.0
-"""Pixels of spread as named, below which no other image is looked for; matches within are on their lines."""
+"""Pixels: spread of a pair as named below which it is simultaneous; matches within are on their lines."""
 
 
 def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
-    """Distances [px] of the matches from their epipolar lines, about their median; None of too few matches.
+    """Distances [px] of the matches from their epipolar lines, less their median; None for too few matches.
 
-    The median is that of a camera that is turned a little, which no shift in time explains.
+    The median is due to a small turn of a camera, not to a shift in time.
     """
     apart, _ = distances(rig, np.zeros(5), *matched_points(left, right))
-    # Before the spread is taken: far mismatches (a tenth of the image) would hide what a shift does to the others.
+    # Far mismatches (a tenth of the image) would hide the effect of a shift on the others.
     apart = apart[np.abs(apart) < 0.1 * rig.right.height]
     return np.asarray(apart - np.median(apart)) if len(apart) >= 40 else None
 
 
 def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> SynchronyFacts:
-    """Facts of the pairs, by whose frame, and of the right image's, ``offsets`` are those of :func:`row_offsets`.
+    """Facts of the pairs; ``offsets``: result of :func:`row_offsets` by frame of the left and of the right image.
 
-    ``rows``: spread [px] of each pair as named; ``partners``: pair and frame of its right image, where that is another;
-    ``contradiction``: one line where there is any.
+    ``rows``: spread [px] of each pair as named; ``partners``: pair and frame of its right image, if that is another;
+    ``contradiction``: one line if there are such.
     """
     rows, partners = list[float](), dict[int, int]()
     for pair, by in offsets.items():
         known = {frame: apart for frame, apart in by.items() if apart is not None}
         if pair not in known:
             continue
-        # Many on their lines, not a small spread: far away in time only things match that hardly move in the image.
+        # By most matches on their lines, not by least spread: of far times only things match that hardly move.
         other = max(known, key=lambda frame: int((np.abs(known[frame]) < MIN_SPREAD_PX).sum()))
         rows.append(mad_sigma(known[pair]))
-        # Another right image explains the rows where their spread is half of that as named.
+        # 0.5: spread with another right image, over that as named, below which the other one is simultaneous.
         if rows[-1] > MIN_SPREAD_PX and mad_sigma(known[other]) < 0.5 * rows[-1]:
             partners[pair] = other
     facts: SynchronyFacts = {"rows": rows, "partners": [list(item) for item in partners.items()]}
@@ -62,8 +62,8 @@ def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> Synchro
 
 
 def _shifts(partners: Mapping[int, int]) -> tuple[str, str]:
-    """Which right image is that of which left one, in words, together of three pairs or more that are off by as many
-    frames; and of these what to add to the numbers of which images."""
+    """Which right image fits which left one, in words, with runs of three or more pairs of the same shift together; and
+    by how much to renumber which images of these runs."""
     which, anew = [], []
     for shift, pairs in groupby(partners, lambda pair: partners[pair] - pair):
         run = list(pairs)

@@ -2,8 +2,8 @@
 
 All corners of all views are adjusted together: both cameras with their distortion, the pose of the right camera in the
 left one's frame, and the pose of the board in each view. OpenCV gives the projection with its derivatives and the start
-of each camera (Zhang 2000, doi:10.1109/34.888718). The common adjustment is made here, because OpenCV's own tells no
-errors of the relative pose, and because a bad view must show in its residual and not spread over all others.
+of each camera (Zhang 2000, doi:10.1109/34.888718). The common adjustment is made here, because OpenCV's own gives no
+errors of the relative pose, and because a bad view must show in its own residual and not in all others.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ MODELS: Mapping[str, tuple[str, ...]] = {
 """Names of the coefficients of each model, in OpenCV's order; radtan4 is radtan without k3."""
 
 LEAST_VIEWS = 3
-"""Two views determine a camera only just, and nothing would tell a bad one."""
+"""Two views just determine a camera: a bad one would not show."""
 
 CORNER_SCALE = 0.5
-"""Pixels; residuals beyond it lose weight in the first adjustment. Corners are found to 0.1 - 0.3 px."""
+"""Pixels; larger residuals lose weight in the first adjustment. Corners are located to 0.1 - 0.3 px."""
 
 FOCAL_STARTS = 0.15 * 1.15 ** np.arange(20)
-"""Shares of an image's longer side that are tried as a fisheye's focal length: a diagonal of 220 to 25 degrees."""
+"""Focal lengths tried for a fisheye, over the image's longer side: a diagonal of 220 to 25 degrees."""
 
 MORE_VIEWS = (
     "take ten views or more with the board tilted by up to 45 degrees, near and far, in all parts of both images"
@@ -75,10 +75,9 @@ class ViewResidual:
 class RigCalibration:
     """Result of a calibration: both lenses, the relative pose, and their errors.
 
-    ``values`` and ``sigma``: what was found and its standard deviation by name (``baseline`` in metres, ``left fx`` in
+    ``values`` and ``sigma``: estimates and their standard deviations by name (``baseline`` in metres, ``left fx`` in
     pixels, ``right k1``, ``rotation x`` in radians, ``translation x`` in metres), from the residuals and the geometry
-    of the views. ``rms``: of all
-    corners that were used, pixels. ``residuals``: one a view; of a view that was left out those of the first
+    of the views. ``rms``: of all used corners, pixels. ``residuals``: one a view; for views left out those of the first
     adjustment.
     """
 
@@ -111,16 +110,16 @@ def calibrate_rig(
     """
     _enough(views)
     task = Adjustment(board, tuple(views), sizes, model)
-    # A bounded loss sees no way from far off, and a fisheye's start is some pixels off.
+    # The robust loss does not converge from far off, and the start of a fisheye is some pixels off.
     x = replace(task, robust=True).solve(task.solve(task.start()) if model == "fisheye" else task.start())
     first = task.residuals(x)
-    # Half a pixel at least: where all views fit to a tenth, four tenths are still a good view.
-    # A view is bad if its RMS residual exceeds both half a pixel and four times the median of all views.
+    # A view is bad if its RMS residual exceeds both half a pixel and four times the median of all views: where all fit
+    # to a tenth of a pixel, four tenths are still good.
     limit = max(0.5, 4.0 * float(np.median([r.worst for r in first])))
     good = [k for k, r in enumerate(first) if keep_bad or r.worst <= limit]
     used = Adjustment(board, tuple(views[k] for k in good), sizes, model)
     _enough(used.views)
-    # From the first solution, now without the bad views' poses.
+    # From the first solution, without the poses of bad views.
     x = used.solve(np.concatenate([x[: used.shared], *(x[task.pose(k)] for k in good)]))
     rig = used.rig(x)
     final = {r.name: r for r in used.residuals(x)}
@@ -138,7 +137,7 @@ def calibrate_rig(
 
 
 def check_sides(rig: RigCalibration) -> None:
-    """Refuse a right camera on the left one's left, or in its place (by four sigma); only views that fit tell that."""
+    """Refuse a right camera to the left of the left one, or in its place (by four sigma); after bad views are out."""
     if rig.values["baseline"] < 4 * rig.sigma["baseline"]:
         text = f"both cameras stand in one place: the baseline is {rig.values['baseline']:.2g} m"
         raise InputError("RIL-313", text, remedy="give images of two cameras: are left and right those of one?")
@@ -175,7 +174,7 @@ class Adjustment:
     sizes: Sizes
     model: str
     robust: bool = False
-    """Cauchy's loss, which bounds what a view can do; else least squares."""
+    """Cauchy's loss, which limits the influence of a view; else least squares."""
 
     @property
     def lens(self) -> int:
@@ -192,7 +191,7 @@ class Adjustment:
         return slice(self.shared + 6 * k, self.shared + 6 * k + 6)
 
     def start(self) -> Floats:
-        """Each camera on its own, and the relative pose that agrees best with those of all views."""
+        """Start values: each camera calibrated on its own, and the relative pose that agrees best with all views'."""
         left, left_poses = self._alone(0, [v.left for v in self.views])
         right, right_poses = self._alone(1, [v.right for v in self.views])
         between = [r @ ll.inverse() for ll, r in zip(left_poses, right_poses, strict=True)]
@@ -205,7 +204,7 @@ class Adjustment:
         boards = [self.board.astype(np.float32).reshape(1, -1, 3)] * len(points)
         flat = [p.astype(np.float32).reshape(1, -1, 2) for p in points]
         size, threads = self.sizes[side], cv2.getNumThreads()
-        # Threads add up the views in any order: the last digits, and so the keys of all that uses the rig, would vary.
+        # Threads add up the views in any order: the last digits, and the keys of all later tasks, would vary.
         cv2.setNumThreads(1)
         try:
             flags = {"rational": cv2.CALIB_RATIONAL_MODEL, "radtan4": cv2.CALIB_FIX_K3}.get(self.model, 0)
@@ -221,9 +220,9 @@ class Adjustment:
         return lens, [RigidTransform(rotation_exp(np.ravel(r)), np.ravel(t)) for r, t in both]
 
     def _equidistant(self, side: int, points: list[Floats]) -> tuple[Floats, list[RigidTransform]]:
-        """Start of a fisheye: no terms but the focal length for which half of the boards miss least.
+        """Start values of a fisheye: the focal length of least median misfit of the boards, other coefficients zero.
 
-        OpenCV's own begins at one focal length, takes corners beyond 90 degrees off the axis then, and gives up.
+        OpenCV's own starts with one focal length, by which corners lie beyond 90 degrees off the axis, and gives up.
         """
         width, height = self.sizes[side]
         centre = np.array([width - 1, height - 1]) / 2
@@ -236,7 +235,7 @@ class Adjustment:
         return np.array([f, f, *centre, 0.0, 0.0, 0.0, 0.0]), poses(f)[1]
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
-        """Residuals (4 n views,), found minus projected negative, pixels, left before right; and their Jacobian."""
+        """Residuals (4 n views,), projected minus measured, pixels, left before right; and their Jacobian."""
         n = 2 * len(self.board)
         residual, jacobian = np.empty(2 * n * len(self.views)), np.zeros((2 * n * len(self.views), x.size))
         lens, rig = self.lens, x[2 * self.lens : self.shared]
@@ -264,9 +263,9 @@ class Adjustment:
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
     def normal(self, x: Floats) -> NormalEquations:
-        """Normal equations; the cost is in pixels squared, infinite where a corner has no image."""
+        """Normal equations; the cost is in pixels squared, infinite if a corner has no image."""
         residual, jacobian = self.evaluate(x)
-        # Of each corner, over the distance beyond which it loses weight.
+        # Squared residual of each corner over the scale of the loss.
         squares = (residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2
         weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
         weighted = (jacobian * weight[:, None]).T
@@ -274,12 +273,12 @@ class Adjustment:
         return NormalEquations(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
 
     def ahead(self, x: Floats, normal: NormalEquations, damping: float) -> Floats:
-        """The unknowns one damped step on."""
+        """The unknowns after one damped step."""
         damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
         return np.asarray(x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0])
 
     def solve(self, x: Floats) -> Floats:
-        """The unknowns of least cost, from ``x`` on.
+        """The unknowns of least cost, starting from ``x``.
 
         Raises
         ------
@@ -302,13 +301,13 @@ class Adjustment:
         return Lens(Camera(fx, fy, cx, cy, *self.sizes[side]), name, tuple(coefficients))
 
     def rig(self, x: Floats) -> Rig:
-        """The rig with the cameras' pinhole parts."""
+        """The rig of the cameras without their distortion."""
         left, right = self.lenses(x)
         pose = x[2 * self.lens : self.shared]
         return Rig(left.camera, right.camera, RigidTransform(rotation_exp(pose[:3]), pose[3:]))
 
     def residuals(self, x: Floats) -> tuple[ViewResidual, ...]:
-        """One a view."""
+        """Residuals of each view."""
         by_view = self.evaluate(x)[0].reshape(len(self.views), 2, -1, 2)
         rms = np.sqrt((by_view**2).sum(-1).mean(-1))
         rig, (left, right) = self.rig(x), self.lenses(x)
@@ -322,12 +321,12 @@ class Adjustment:
         return tuple(out)
 
     def errors(self, x: Floats) -> tuple[float, dict[str, float]]:
-        """RMS of a corner, pixels, and standard deviations of what all views share, by name.
+        """RMS of a corner, pixels, and standard deviations of the unknowns that all views share, by name.
 
         Raises
         ------
         DegenerateError
-            Some unknown changes no residual.
+            The views do not determine some unknown.
         """
         residual, jacobian = self.evaluate(x)
         scale = np.linalg.norm(jacobian, axis=0)
@@ -352,13 +351,13 @@ class Adjustment:
 
 
 def _flat_pose(board: Floats, angles: Floats) -> tuple[float, RigidTransform]:
-    """Pose of a flat board, and the RMS angle (radians) by which it misses what a camera sees of it.
+    """RMS angle (radians) between the corners of a flat board and the seen directions, and the board's pose.
 
     Parameters
     ----------
     board : (n, 3), z = 0.
-    angles : (n, 2) angle off the axis, in radians, along columns and rows. Directions are exact at any angle, where a
-        pinhole camera's coordinates become infinite.
+    angles : (n, 2) angle off the axis, in radians, along columns and rows; unlike coordinates of a pinhole camera
+        finite at any angle.
     """
     off = np.hypot(angles[:, 0], angles[:, 1])
     seen = np.column_stack([angles * np.sinc(off / np.pi)[:, None], np.cos(off)])
@@ -387,7 +386,7 @@ def _vector(T: RigidTransform) -> Floats:
 
 
 def _apart(a: RigidTransform, b: RigidTransform) -> float:
-    """How far two poses differ: angle in radians, and position relative to its size."""
+    """Difference of two poses: angle in radians plus difference of positions relative to their size."""
     size = float(np.linalg.norm(a.translation) + np.linalg.norm(b.translation))
     away = float(np.linalg.norm(a.translation - b.translation)) / max(size, 1e-12)
     return float(angle(a.rotation @ b.rotation.T)) + away

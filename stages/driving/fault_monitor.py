@@ -1,11 +1,11 @@
-"""Safety stops of a drive (section 2.2): what the sensors and the tracking say, image by image, against thresholds.
+"""Safety stops of a drive (section 2.2): readings of the sensors and the tracking, image by image, against thresholds.
 
-    attitude      the inclinometer's tilt of the body beyond what the vehicle may have
+    attitude      the inclinometer's tilt of the body exceeds the vehicle's limit
     acceleration  a peak of the accelerometer: the vehicle has struck or dropped off something
     lost          fewer landmarks are followed than a pose needs
-    slip          the way by the wheels and the way by vision differ by more than their errors explain
+    slip          the distances by the wheels and by vision differ by more than their errors explain
 
-An image is judged by itself and the images before it, as on the vehicle, which stops at the first image that exceeds a
+An image is judged with the images before it alone, as on the vehicle, which stops at the first image that exceeds a
 threshold.
 """
 
@@ -25,16 +25,16 @@ from rille.stages.facts.planning import StopFacts
 from rille.stages.geometry.geometry import RigidTransform, heading_of
 
 MAX_ACCELERATION = 3.0
-"""Vertical acceleration, m/s2, at which it stops; permitted steps cause less than half of it."""
+"""Vertical acceleration, m/s2, at which the vehicle stops; permitted steps cause less than half of it."""
 MIN_LANDMARKS = 12
-"""Landmarks that agree with a pose; six determine it."""
+"""Fewest landmarks that agree with a pose; six determine it."""
 MAX_TURN_DEG = 8.0
-"""Difference between the turn by the wheels and by the images."""
+"""Largest difference between the turns by the wheels and by the images."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``stop``: index of the image at which the vehicle stopped, None; ``kind`` and ``reason`` why."""
+    """``stop``: index of the image at which the vehicle stopped, else None; ``kind`` and ``reason`` why."""
 
     stop: int | None
     kind: str
@@ -45,7 +45,7 @@ class Readings(NamedTuple):
     """Readings of the sensors at each frame.
 
     ``up`` (frame, 3) direction of up in the left camera; ``acceleration`` (frame,) m/s2; ``odometry`` (frame, 3) x, y
-    (m), heading (rad) by the wheels, less those of the first frame.
+    (m), heading (rad) by the wheels, relative to those of the first frame.
     """
 
     up: Floats
@@ -60,27 +60,27 @@ def judge(
     T_vehicle_left: RigidTransform,
     vehicle: Mapping[str, Any],
 ) -> Verdict:
-    """The first image of a leg that is beyond a threshold.
+    """Verdict on a leg: its first image that exceeds a threshold.
 
     Parameters
     ----------
     readings : of the sensors at each frame.
     poses : (frame, 3, 4) T_local_left by vision.
-    tracked : facts of each pose: the number of its ``inliers``, and why it is ``lost`` where it is.
+    tracked : facts of each pose: the number of its ``inliers``, and why it is ``lost``, if it is.
     vehicle : its ``max_slope_deg`` and ``wheel_base``.
     """
-    # Motions are those of the vehicle's middle, as the wheels report them, not of the camera, which a turn swings.
+    # Motions are those of the vehicle's centre, as the wheels report them, not of the camera, which moves in a turn.
     there = [bool(np.isfinite(pose).all()) for pose in poses]
     key = RigidTransform.from_matrix(poses[0]) @ T_vehicle_left.inverse() if there[0] else RigidTransform.identity()
-    # The body averages over its wheels, so it tilts less than the ground.
+    # The limit for the ground: the body averages over its wheels and tilts less.
     steepest = float(vehicle["max_slope_deg"])
     sensors = (("attitude", "inclinometer"), ("acceleration", "accelerometer"), ("slip", "wheel odometry"))
     for k in range(1, len(poses)):
         for (kind, sensor), values in zip(sensors, readings, strict=True):
-            # NaN is beyond no threshold.
+            # NaN would exceed no threshold.
             if not np.isfinite(values[k]).all():
                 return Verdict(k, kind, f"the {sensor} gives no reading")
-        # Rounding may carry the cosine of a vehicle that is upright, or upside down, beyond 1.
+        # Rounding may make the cosine of an upright vehicle exceed 1.
         tilt = math.degrees(math.acos(np.clip((T_vehicle_left.rotation @ readings.up[k])[2], -1.0, 1.0)))
         if tilt > steepest:
             return Verdict(k, "attitude", f"tilt of {tilt:.1f} degrees by the inclinometer, {steepest:.1f} permitted")
@@ -101,19 +101,18 @@ def judge(
 
 
 def _disagreement(wheels: Floats, moved: RigidTransform, base: float) -> str:
-    """In what way wheels and vision contradict each other, in words; empty: they do not."""
+    """Contradiction between wheels and vision, in words; empty: there is none."""
     turn = heading_of(moved)
     # The remainder, since headings jump by a full turn.
     apart = math.degrees(abs(math.remainder(turn - float(wheels[2]), 2 * math.pi)))
     if apart > MAX_TURN_DEG:
         return f"wheels and vision differ by {apart:.1f} degrees in heading, {MAX_TURN_DEG:g} permitted"
     way, seen = float(np.hypot(wheels[0], wheels[1])), float(np.linalg.norm(moved.translation))
-    # Over a short way the error of vision is as large as the slip that is looked for.
-    # 0.3: distance by the wheels from which slip is judged; below, the errors of the poses are as large.
+    # 0.3 wheel bases: least distance by the wheels for which slip is judged; below, errors of the poses are as large.
     if way < 0.3 * base:
         return ""
     slip = 1.0 - seen / way
-    # 0.2: of the distance by the wheels; usual soil: 0.05 to 0.15.
+    # 0.2: largest slip, over the distance by the wheels; usual soil has 0.05 to 0.15.
     if abs(slip) <= 0.2:
         return ""
     return f"slip of {slip:.0%}: {1000 * way:.0f} mm by the wheels, {1000 * seen:.0f} mm by vision"
@@ -130,7 +129,7 @@ def fault_monitor_stage(
     vehicle: Mapping[str, Any],
 ) -> Bundle[StopFacts]:
     """Whether the vehicle stopped on a leg for its safety, where and why."""
-    # Of the readings, those frames that were resected.
+    # Readings at the resected frames.
     wheels = np.asarray(sense["odometry"])[rows]
     verdict = judge(
         Readings(np.asarray(sense["up"])[rows], np.asarray(sense["acceleration"])[rows], wheels - wheels[0]),

@@ -1,12 +1,12 @@
-"""Detection of obstacles on the way: what rises above the last elevation model where none should be.
+"""Detection of obstacles during a leg: points that rise above the last elevation model.
 
-The paper leaves it open (section 8). Between two stops there is one camera and its motion: coarse displacements between
-two images some centimetres of way apart (stage ``motion``) are a stereo pair along the drive, whose relative pose the
-resection has just found. For each cell of the last elevation model ahead of the vehicle the model predicts where its
-point is seen; its displacement is a disparity of that pair (:func:`~rille.stages.geometry.epipolar.inverse_depth`), and
-so a point in space. It counts as raised where it lies higher than all of the model within reach of its errors, by more
-than half a wheel's radius and by more than its noise. Enough raised points together, which are much of the points seen
-there, are an obstacle: the vehicle stops and looks.
+The paper leaves this open (section 8). Between two stops there is one camera and its motion: two images some
+centimetres apart are a stereo pair along the drive, with coarse displacements (stage ``motion``) and the relative pose
+of the resection. For each cell of the last elevation model ahead of the vehicle the model predicts the pixel of its
+point; the displacement there is a disparity of that pair (:func:`~rille.stages.geometry.epipolar.inverse_depth`), and
+so gives a point in space. It counts as raised if it lies higher than all of the model nearby, by more than half a
+wheel's radius and by more than its noise. Enough raised points together, if they are a large share of the points there,
+are an obstacle: the vehicle stops and looks.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from rille.stages.hazard.vehicle import Vehicle
 LEVEL = 1
 """Pyramid level of the displacements: half the resolution."""
 MIN_RISE_WHEELS, MIN_RISE_SIGMAS = 0.25, 2.0
-"""Rise over the model from which a point counts as raised [wheel diameters], and standard deviations of it."""
+"""Least rise over the model of a raised point [wheel diameters], and least rise in its standard deviations."""
 MIN_POINTS, MIN_SHARE = 8, 0.35
-"""Raised points within one wheel diameter that are an obstacle, and their share of all points there."""
+"""Fewest raised points of an obstacle within one wheel diameter, and their least share of all points there."""
 
 
 class ObstacleMonitorParams(Params):
@@ -59,16 +59,16 @@ class LastModel:
 
     @staticmethod
     def of(elevation: NDArray[np.floating], lattice: Lattice, blur: float) -> LastModel:
-        """Build from elevations (row, col), m, NaN unknown; ``top`` is the highest within ``blur`` metres."""
+        """Model of elevations (row, col), m, NaN unknown; ``top`` is the highest within ``blur`` metres."""
         z = np.asarray(elevation, np.float64)
         side = 2 * round(blur / lattice.cell) + 1
-        # The highest nearby: an error of the pose by that much must not make a known stone rise.
+        # The highest nearby, so that errors of the pose do not raise a known stone.
         top = scipy.ndimage.maximum_filter(np.where(np.isnan(z), -np.inf, z), side, mode="nearest")
         known = np.isfinite(z)
         return LastModel(lattice, top, np.column_stack([lattice.xy()[known], z[known]]))
 
     def top_at(self, xy: Floats) -> Floats:
-        """Greatest height near points (n, 2); -inf where nothing near is known, NaN outside."""
+        """Greatest height near points (n, 2); -inf if no cell nearby is known, NaN outside."""
         at = np.rint(self.lattice.index(np.nan_to_num(xy))).astype(np.int64)
         inside = ((at >= 0) & (at < self.lattice.shape)).all(axis=1) & np.isfinite(xy).all(axis=1)
         out = np.full(len(xy), np.nan)
@@ -78,7 +78,7 @@ class LastModel:
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Two images of the way: T_local_left of both, and displacements of the first's level grid in level-0 pixels."""
+    """Two images of a leg: T_local_left of both, and displacements of the first one's level grid in level-0 pixels."""
 
     before: RigidTransform
     now: RigidTransform
@@ -99,7 +99,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A group of raised points: how many, and ``place`` (2,) right and ahead of the vehicle, m."""
+    """A group of raised points: their number, and ``place`` (2,) right and ahead of the vehicle, m."""
 
     count: int
     place: Floats
@@ -112,12 +112,12 @@ def look(
     T_vehicle_left: RigidTransform,
     vehicle: Vehicle,
 ) -> Points:
-    """Compute the points that two images show ahead of the vehicle, and which of them rise above the model."""
+    """Points ahead of the vehicle by two images, and which of them rise above the model."""
     wheel = vehicle.wheel_diameter
     T_now = view.now.inverse()
     T_vehicle_local = T_vehicle_left @ T_now
     ahead = T_vehicle_local.apply(surface.points)
-    # Ten wheel diameters ahead of the centre are watched, and half of one beside the wheels.
+    # Watched: ten wheel diameters ahead of the centre, and half of one beside the wheels.
     wide = 0.5 * vehicle.track + 0.5 * wheel
     near = (np.abs(ahead[:, 0]) <= wide) & (ahead[:, 1] > 0.5 * vehicle.wheel_base) & (ahead[:, 1] <= 10.0 * wheel)
     pixel, ground, first = _seen(view, surface.points[near], camera)
@@ -128,8 +128,8 @@ def look(
         q = view.before.apply(camera.rays(first) / np.where(rho > 0, rho, np.nan)[:, None])
     # Half a pixel of the pyramid's level.
     error = 0.5 * 2.0**view.level
-    # A displacement across the epipolar line is a wrong match, not another depth; obstacles are much nearer than the
-    # ground behind them, but not at the camera.
+    # A displacement across the epipolar line is a wrong match; obstacles are nearer than the ground behind them, but
+    # not at the camera.
     missed = first + displacement - camera.project(T_now.apply(q))
     away, behind = (np.linalg.norm(p - view.before.translation, axis=1) for p in (q, ground))
     along = (np.hypot(*missed.T) <= 3.0 * error) & (away > 0.2 * behind) & (away < 1.5 * behind)
@@ -141,9 +141,9 @@ def look(
 
 
 def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Grid pixels (n, 2) that show a cell and have a displacement, the ground they show (n, 3), their centres (n, 2).
+    """Grid pixels (n, 2) that show a cell and have a displacement, points (n, 3) of the ground, pixel centres (n, 2).
 
-    Of the cells that one pixel shows, the nearest one; its ground is where the pixel's ray meets the cell's height.
+    Of several cells in one pixel the nearest one is used; the point is where the pixel's ray meets the cell's height.
     """
     rows, cols = view.matched.shape
     scale = 2.0**view.level
@@ -152,14 +152,14 @@ def _seen(view: ViewPair, cells: Floats, camera: Camera) -> tuple[NDArray[np.int
     ok: Bools = np.asarray(((at >= 0) & (at < [cols, rows])).all(axis=1))
     ok[ok] &= view.matched[at[ok, 1], at[ok, 0]]
     at, cells, depth = at[ok], cells[ok], in_camera[ok, 2]
-    # By pixel, then by depth: the first of each pixel is the one that hides the others.
+    # By pixel, then by depth: the first cell of each pixel hides the others.
     flat = at[:, 1] * cols + at[:, 0]
     order = np.lexsort((depth, flat))
     keep = order[np.unique(flat[order], return_index=True)[1]]
     centre = (at[keep] + 0.5) * scale - 0.5
     rays = camera.rays(centre) @ view.before.rotation.T
     origin = view.before.translation
-    # On the pixel's own ray, not at the cell's middle: half a cell beside it would already look like a displacement.
+    # On the pixel's ray, not at the cell's centre: half a cell off would look like a displacement.
     ground = origin + ((cells[keep, 2] - origin[2]) / rays[:, 2])[:, None] * rays
     return np.asarray(at[keep]), np.asarray(ground), np.asarray(centre)
 
@@ -211,7 +211,7 @@ def obstacle_monitor_stage(
     lattice = Lattice.from_dict(inputs.dem.meta["lattice"])
     # A point is compared with the greatest height of the model within half a wheel.
     surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, 0.5 * wheel)
-    poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which is for the stage safety to judge
+    poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which stage fault_monitor judges
     known = posed(poses)
     frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]
     raised = np.zeros(len(frames), np.int32)
@@ -243,19 +243,18 @@ def obstacle_monitor_stage(
 
 
 def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:
-    """Which images of a leg are compared: each with the last one before that is a baseline of way behind it.
+    """Pairs of images of a leg to compare: each with the latest earlier one that is a baseline behind it.
 
     ``odometry`` (frame, 3): x, y (m), heading (rad) by the wheels.
     """
     out = []
     for j in range(1, len(odometry)):
-        # From the latest backwards: the first image far enough behind is the most alike.
+        # From the latest backwards: the first image far enough behind is most alike.
         for i in range(j - 1, -1, -1):
-            # 6.0: largest turn between two compared images; at 7 and 8 degrees points seemed to rise above ground that
-            # the model had right.
+            # 6.0: largest turn between two compared images; at 7 and 8 degrees points of right ground seemed to rise.
             if math.degrees(abs(odometry[j, 2] - odometry[i, 2])) > 6.0:
                 break
-            # 1.6: distance driven between the two compared images [wheel diameters]; larger: less noise.
+            # 1.6: least distance between the two compared images [wheel diameters]; larger: less noise.
             if math.hypot(*(odometry[j, :2] - odometry[i, :2])) >= 1.6 * wheel - 1e-9:
                 out.append((i, j))
                 break

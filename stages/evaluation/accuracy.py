@@ -8,7 +8,7 @@ counted and left out. Where truth has a gap, its path is taken to be straight, w
 * RPE: ``(Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1)`` of successive frames (Sturm et al. 2012, doi:10.1109/IROS.2012.6385773);
 * drift: error of the last position after making the first poses equal, over the true length of the path;
 * scale: least-squares factor between the lengths of the motions of successive frames;
-* NEES: mean squared error over the claimed one, per degree of freedom: 1 where the claims are right; of whole poses,
+* NEES: mean squared error over the claimed one, per degree of freedom: 1 if the claims are right; of whole poses,
   of positions and of rotations, since a truth may be good in one and poor in the other. Errors of the truth itself,
   where they are stated, are added to what is claimed.
 """
@@ -38,12 +38,12 @@ CLAIMS = (
     ("nees_position", slice(0, 3), ", of positions alone"),
     ("nees_rotation", slice(3, 6), ", of rotations alone"),
 )
-"""Figures of the covariances: name, rows of a covariance that are judged, and what they are in words."""
+"""Figures of the covariances: name, rows of the covariance that are judged, description."""
 
 
 class TruthSource(NamedTuple):
-    """Of the file of true poses: ``mount``, T_body_left, by which its poses were multiplied; ``sigmas`` of them, m and
-    rad; ``record``, positions at times of its own, and ``moments`` (frame,), s, of the images.
+    """Source of the true poses: ``mount``, T_body_left, by which its poses were multiplied; their ``sigmas``, m and
+    rad; ``record``, its positions at its own times, and ``moments`` (frame,), s, of the images.
     """
 
     mount: RigidTransform = RigidTransform.identity()
@@ -71,24 +71,24 @@ def trajectory_accuracy(
     ----------
     estimate : (frame, 3, 4) T_world_left, metres; NaN where a frame has no pose.
     truth : (frame, 3, 4) T_truth_left of the same frames; NaN where there is no truth.
-    covariance : (frame, 6, 6) of the estimate in the world, where it claims one; see
+    covariance : (frame, 6, 6) of the estimate in the world, if it has one; see
     :mod:`rille.stages.odometry.resection.resect`.
     sigma_m, sigma_rad : standard deviations of the true positions, and of the true rotations about each axis.
 
     Returns
     -------
-    Arrays ``position``, ``position_truth`` (frame, xyz) in the world frame (truth brought there by the first frame that
-    has both), and metrics by name; with fewer than two frames that have both no error applies.
+    Arrays ``position``, ``position_truth`` (frame, xyz) in the world frame (truth aligned at the first frame that has
+    both), and metrics by name; errors do not apply with fewer than two frames that have both.
     """
     has_pose, has_truth = posed(estimate), posed(truth)
     judged, figures = np.flatnonzero(has_pose & has_truth), counts(has_pose, has_truth)
     aligned = np.full_like(truth, np.nan)
     if len(judged):
-        # Aligned at the first frame that has both: drift grows from the run's own start, wherever the truth's origin.
+        # Aligned at the first frame that has both: drift grows from the start of the run, not from the truth's origin.
         start = judged[0]
         aligned = rigid.compose(estimate[start], rigid.compose(rigid.inverse(truth[start]), truth))
     if len(judged) > 1:
-        # With the frames between that have no pose: the true path leads on there.
+        # With frames between that have no pose, since the true path goes on there.
         whole = slice(judged[0], judged[-1] + 1)
         figures |= _absolute(estimate[whole, :, 3], aligned[whole, :, 3])
         figures |= _relative(estimate, truth) | _scale(estimate, truth)
@@ -115,7 +115,7 @@ def counts(has_pose: Bools, has_truth: Bools) -> dict[str, Metric]:
 
 
 def over_length(error: float, truth: Floats, what: str) -> tuple[Metric, Metric]:
-    """Length of the true way (frame, 2 or 3), m, of the judged frames, and an ``error``, m, at its end over it."""
+    """Length, m, of the true path (frame, 2 or 3) of the judged frames; ``error``, m, at its end over the length."""
     length = float(rigid.lengths_along(truth)[-1])
     drift = 100.0 * error / length if length > 0 else "the camera did not move"
     way = "true length from the first to the last judged frame, straight over gaps of the truth"
@@ -165,7 +165,7 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
 def _truth_covariance(away: Floats, sigma_m: float, sigma_rad: float) -> Floats:
     """Covariances (n, 6, 6) of (position m, rotation rad) of true poses that lie ``away`` (n, 3), m, from the first.
 
-    The first was made equal to the estimate. Each has errors of its own; those of the first one move all others, and
+    The first was made equal to the estimate. Each has its own errors; those of the first also shift all others, and
     turn them about it.
     """
     own, moved = np.diag(np.repeat(np.square([sigma_m, sigma_rad]), 3)), np.tile(np.eye(6), (len(away), 1, 1))
@@ -174,8 +174,8 @@ def _truth_covariance(away: Floats, sigma_m: float, sigma_rad: float) -> Floats:
 
 
 def nees(P: Floats, aligned: Floats, covariance: Floats) -> Mapping[str, float | str]:
-    """Mean squared errors over the claimed ones, per degree of freedom, by the names of :data:`CLAIMS`; or why they do
-    not apply.
+    """Mean squared errors over the claimed ones, per degree of freedom, by the names of :data:`CLAIMS`; or the reason
+    why there are none.
 
     ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
     exact: ``aligned`` is the truth with the first poses made equal.
@@ -232,13 +232,13 @@ def accuracy_stage(
         warnings = better_reading(estimate[both], true[both], source.mount, stated, mounted)
         off = None if warnings else off
         late = None
-        # Within what the estimate states of itself another clock fits its own errors.
+        # Errors within the estimate's stated ones another clock might fit by chance.
         if source.record is not None and not warnings and float(figures["ate_rmse"]["value"] or 0.0) > stated:
             late = late_truth(np.array(source.moments), estimate[:, :, 3], source.record)
         if off is not None:
             _, without = trajectory_accuracy(estimate, rigid.compose(true, off), claimed, *source.sigmas)
             left = float(without["ate_rmse"]["value"] or 0.0)
-            # A lever arm ahead and a clock look alike, but for turns.
+            # A lever arm ahead and a clock offset have the same effect except in turns.
             if late is None or left <= late.error:
                 late, warnings = None, [misplaced(off, source.mount, figures, without)]
                 figures |= without_it(off, without)

@@ -1,9 +1,9 @@
-"""Trajectory against the crosscheck's: how far apart two independent answers are, frame by frame.
+"""Disagreement of the trajectory and the crosscheck's, frame by frame.
 
-The crosscheck's poses are laid on ours by one rotation and translation, without scale (each unbroken piece by its
-own); what remains is the disagreement. It does not say who is wrong, but where the two part, one of them is. What both
-share, the given calibration, it cannot judge: a wrong baseline stretches both alike. But a frame whose two images fit
-the given rig worse than those of all others is flagged as well, even where its pose is right by the left image alone.
+The crosscheck's poses are aligned with ours by one rotation and translation, without scale (one for each unbroken
+piece); the rest is the disagreement. Where the two disagree, one of them is wrong. Errors of the calibration, which
+both share, do not show: a wrong baseline stretches both alike. But a frame whose two images fit the given rig worse
+than those of all others is flagged as well, even if its pose is right by the left image alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MIN_SIGMAS, MIN_RATIO = 5.0, 2.0
 
 
 class Reason(NamedTuple):
-    """What a frame is flagged for: its bit of ``flagged``, in words, and the least value that counts."""
+    """Reason to flag a frame: its bit of ``flagged``, in words, and the least value that counts."""
 
     bit: int
     words: str
@@ -49,7 +49,7 @@ focal length of 1100 pixels."""
 def compare(
     ours: Floats, theirs: Floats, piece: NDArray[np.integer[Any]]
 ) -> tuple[dict[str, Floats], float | None, float | None]:
-    """Disagreement of two trajectories.
+    """Disagreement of two trajectories, and the scale between them.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def compare(
     -------
     Arrays ``poses`` (frame, 3, 4): theirs in the world; ``distance`` m, ``angle`` rad of each frame; ``step_distance``
     m, ``step_angle`` rad of the motion since the frame before. NaN where not both have poses, or a piece shares fewer
-    than two frames with us. The scale that would fit theirs to ours best (None for a camera at rest, whose orientations
-    alone align it), and the RMS disagreement of positions with it, m.
+    than two frames with ours. The scale that would fit theirs to ours best (None for a camera at rest, which is aligned
+    by orientations alone), and the RMS disagreement of positions with it, m.
     """
     n = len(ours)
     arrays = {name: np.full(n, np.nan) for name in ("distance", "angle", "step_distance", "step_angle")}
@@ -71,15 +71,15 @@ def compare(
         rows = np.flatnonzero(there & (piece == number))
         if len(rows) < 2:
             continue
-        # Frames whose neighbour before is in the piece as well: a step over a gap is no motion between frames. Errors
-        # of motions are in the frame before, and so free of the alignment.
+        # Only frames whose predecessor is in the piece too: a step over a gap is no motion between frames. Errors of
+        # motions are in the frame before, and so independent of the alignment.
         second = rows[1:][np.diff(rows) == 1]
         E = rigid.relative_error(*(rigid.motion(poses, second - 1, second) for poses in (theirs, ours)))
         arrays["step_distance"][second] = np.linalg.norm(E[:, :, 3], axis=1)
         arrays["step_angle"][second] = rigid.angle(E)
         rests = at_rest(ours[rows], arrays["step_distance"][second])
-        # A camera at rest: its positions are noise, and would turn the alignment to any side. Otherwise positions
-        # decide it, as in an absolute trajectory error.
+        # Positions of a camera at rest are noise, and would turn the alignment at random. Otherwise they decide it, as
+        # in an absolute trajectory error.
         share = math.inf if rests else 0.1
         laid[piece == number] = rigid.compose(rigid.alignment(theirs[rows], ours[rows], share), theirs[piece == number])
         if not rests:
@@ -87,7 +87,7 @@ def compare(
             centred.append(both - both.mean(axis=1, keepdims=True))
     arrays["distance"] = np.linalg.norm(laid[:, :, 3] - ours[:, :, 3], axis=1)
     arrays["angle"] = rigid.angles_between(laid, ours)
-    # Least squares of b = s a over all pieces at once, for one rig has one scale.
+    # Least squares of b = s a over all pieces together, because one rig has one scale.
     a, b = np.concatenate(centred, axis=1)
     cross, square = float((a * b).sum()), float((a * a).sum())
     scale = cross / square if square > 0 and cross > 0 else None
@@ -95,16 +95,16 @@ def compare(
 
 
 def at_rest(poses: Floats, step_distance: Floats) -> bool:
-    """Whether all positions lie within what the two trajectories differ by from step to step."""
+    """Whether the spread of positions is small against the difference of the two trajectories from step to step."""
     # 10.0: ratio of the spread of positions to the error of a step below which a camera counts as at rest: its
     # positions then determine no rotation.
     return bool(step_distance.size and rigid.spread(poses) < 10.0 * np.sqrt(np.mean(step_distance**2)))
 
 
 def leads_away(poses: Floats) -> bool:
-    """Whether the last position lies farther from the first than noise of steps would lead by chance."""
+    """Whether the last position lies farther from the first than by the noise of the steps."""
     steps = np.diff(poses[:, :, 3], axis=0)
-    # 2.0: a random walk in three dimensions ends as far off, by the root of its squared steps, in 0.7 % of cases.
+    # 2.0 roots of the sum of squared steps: a random walk in three dimensions ends farther off in 0.7 % of cases.
     return bool(np.linalg.norm(steps.sum(axis=0)) > 2.0 * np.linalg.norm(steps))
 
 
@@ -127,7 +127,8 @@ def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:
 
 
 def carried(piece: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
-    """Piece (frame,) that each frame counts to: a lost one (-1) to that of the posed one before it, or to the first."""
+    """Piece (frame,) of each frame; frames without a pose (-1) belong to the piece of the posed frame before, or to the
+    first one."""
     posed = np.flatnonzero(piece >= 0)
     if not posed.size:
         return piece
@@ -137,9 +138,9 @@ def carried(piece: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
 def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pieces (frame,) that are unbroken in both trajectories, -1 where the other program has none.
 
-    A frame that we lost counts to our piece before it, so that the other program's pose of it is shown.
+    A frame without our pose belongs to our piece before it, so that the other program's pose of it is shown.
     """
-    # A piece is a pair of piece numbers, ours and theirs, counted anew.
+    # A piece is a pair of piece numbers, ours and theirs, numbered anew.
     pairs = np.stack([theirs, carried(ours)])
     return np.where(theirs >= 0, np.unique(pairs, axis=1, return_inverse=True)[1].reshape(-1), -1)
 
@@ -171,7 +172,7 @@ def agreement_stage(
     arrays["line_distance"] = lines
     flags, limits = flag(arrays)
     compared = np.isfinite(arrays["distance"])
-    # Our pieces lie in frames of their own: from one to the next there is no way.
+    # Each of our pieces has its own frame of reference: no path leads from one to the next.
     there = np.diff(own[compared]) == 0
     length = float(np.linalg.norm(np.diff(ours[compared, :, 3], axis=0), axis=1)[there].sum())
     apart = {name: rms(values[np.isfinite(values), None]) for name, values in arrays.items() if name in REASONS}

@@ -9,8 +9,7 @@ from rille.stages.facts.evaluation import Metric, metric
 
 
 def within(error: AnyArray, std: AnyArray, what: str) -> dict[str, Metric]:
-    """Shares of the errors (n,) that are no greater than once and twice their ``std`` (n,), in their unit; ``what``
-    was measured."""
+    """Shares of the errors (n,) up to one and two ``std`` (n,), in the same unit; ``what`` was measured, in words."""
     return {
         f"within_{count}_sigma": metric(
             float(np.mean(error <= count * std)) if error.size else None, "1", f"share within {deviations} {what}"

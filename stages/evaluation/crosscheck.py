@@ -1,12 +1,12 @@
 """Camera poses by another program, for comparison: structure from motion by COLMAP over a window of stereo frames.
 
-Nothing of the chain enters. Verification of matches, registration, triangulation and bundle adjustment are pycolmap's
-(Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445), features OpenCV's (:mod:`rille.stages.imaging.features`). What
-both share is the given calibration: the two cameras are one rig whose relative pose and intrinsics are held, so that
-the scale is metric. A model begins with the two images of one frame, whose baseline is known. Of its own, COLMAP begins
-with any two: at the scale that they then have by chance the rig's baseline may seem to be nothing, and the model grows
-to thousands of times its size. Everything runs in memory, on one thread and with given seeds, so that the same images
-give the same bytes.
+No other stage of the run enters. Verification of matches, registration, triangulation and bundle adjustment are
+pycolmap's (Schönberger & Frahm 2016, doi:10.1109/CVPR.2016.445), features OpenCV's
+(:mod:`rille.stages.imaging.features`). Both trajectories share the given calibration: the two cameras are one rig whose
+relative pose and intrinsics are held, so that the scale is metric. A model begins with the two images of one frame,
+whose baseline is known. By default COLMAP begins with any two images, at an arbitrary scale, by which the rig's
+baseline may be negligible, and the model grows to thousands of times its size. Everything runs in memory, on one thread
+and with fixed seeds, so that the same images give the same bytes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import PIXEL_CENTRE, match
 
 OVERLAP = 3
-"""Frames common to successive windows; they join the windows."""
+"""Frames that successive windows share, by which they are joined."""
 
 SEED = 0
-"""Of COLMAP's random sampling."""
+"""Seed of COLMAP's random sampling."""
 
 MIN_MATCHES = 15
 """COLMAP's own limit for a pair of images to count."""
@@ -56,11 +56,11 @@ def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:
 
 
 def image_pairs(frames: int) -> list[tuple[int, int]]:
-    """Image numbers to match: left with right of a frame, and each camera with itself over two frames; a third
-    one changes no error by a tenth.
+    """Pairs of image numbers to match: left and right of a frame, and images of one camera up to two frames apart;
+    three change no error by a tenth.
 
-    Image ``2 k + 1`` is the left one of frame k, ``2 k + 2`` the right one. Left against right of *other* frames is
-    left out: it takes time and adds no accuracy.
+    Image ``2 k + 1`` is the left one of frame k, ``2 k + 2`` the right one. Left and right of *other* frames are not
+    matched: that takes time and adds no accuracy.
     """
     pairs = []
     for k in range(frames):
@@ -72,7 +72,7 @@ def image_pairs(frames: int) -> list[tuple[int, int]]:
 
 
 def colmap_rig(rig: Rig) -> tuple[list[Any], Any]:
-    """Left and right camera as COLMAP has them, without lens distortion, and their rig."""
+    """Left and right camera, without lens distortion, and their rig in COLMAP's form."""
     from rille.stages.geometry.colmap import pycolmap
 
     cameras = []
@@ -89,9 +89,9 @@ def colmap_rig(rig: Rig) -> tuple[list[Any], Any]:
 
 
 def _widened(camera: Any) -> Floats:
-    """Columns and rows, px, by which points move in a camera that is made to hold its principal point.
+    """Columns and rows, px, by which a camera is extended at the left and at the top to hold its principal point.
 
-    COLMAP registers no image whose principal point lies outside of it, as that of images that were cut may do.
+    COLMAP registers no image with its principal point outside, as cropped images may have it.
     """
     shift: Floats = np.maximum(-np.asarray(camera.params[2:], np.float64), 0.0)
     camera.params = np.array([*camera.params[:2], *(camera.params[2:] + shift)])
@@ -103,7 +103,7 @@ def _widened(camera: Any) -> Floats:
 
 
 def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verified:
-    """Rig, features and verified matches to the database; the matches of each image pair that has enough.
+    """Write rig, features and verified matches to the database; return the matches of each image pair that has enough.
 
     ``features`` of stage ``features``, left and right in turn.
     """
@@ -127,7 +127,7 @@ def _write_frames(database: Any, rig: Rig, features: Sequence[Bundle]) -> Verifi
         database.write_frame(frame, use_frame_id=True)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed, options.ransac.num_threads = SEED, 1
-    # COLMAP's 100 are more than needed: nearly all matches are right; where they are not, it draws more.
+    # COLMAP's 100 are more than needed: nearly all matches are right; else it draws more.
     options.ransac.min_num_trials = 30
     options.detect_watermark = False
     verified = {}
@@ -161,8 +161,8 @@ def _stereo_points(features: Sequence[Bundle], verified: Verified) -> dict[int, 
 def _line_distances(rig: Rig, frames: int, stereo: Mapping[int, tuple[Floats, Floats]]) -> Floats:
     """Median distance (frame,), px, of the matches of left and right from their epipolar lines under the given rig.
 
-    NaN where the two do not match. Verified are matches by any motion between two cameras: an image that has slipped in
-    its row is no outlier there, and registration does without it.
+    NaN where the two do not match. Matches are verified by any motion between two cameras: a right image shifted in its
+    rows passes, and registration works without it.
     """
     out = np.full(frames, np.nan)
     for left, points in stereo.items():
@@ -171,7 +171,7 @@ def _line_distances(rig: Rig, frames: int, stereo: Mapping[int, tuple[Floats, Fl
 
 
 def _near(rig: Rig, left: Floats, right: Floats) -> int:
-    """Number of the matches whose rays meet under an angle at which COLMAP keeps the point."""
+    """Number of the matches whose rays meet at an angle at which COLMAP keeps the point."""
     rays = rig.left.rays(left), rig.right.rays(right) @ rig.T_right_left.rotation
     cosine = (rays[0] * rays[1]).sum(axis=1) / np.prod([np.linalg.norm(r, axis=1) for r in rays], axis=0)
     # COLMAP drops points seen under less than 1.5 degrees, and registers the next images by the nearer ones alone.
@@ -179,8 +179,8 @@ def _near(rig: Rig, left: Floats, right: Floats) -> int:
 
 
 def _models(database: Any, starts: Mapping[int, int]) -> list[Any]:
-    """Models, each begun with the stereo pair of the most near points (``starts``, by the number of the left image)
-    that no model holds yet, as long as it might become the greatest."""
+    """Models, each begun with the stereo pair of most near points (``starts``, by the number of the left image) that
+    is in no model yet, as long as it might become the largest."""
     models, left, most = [], set(starts), 0
     while len(left) > most:
         start = max(left, key=lambda number: (starts[number], -number))
@@ -211,9 +211,9 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
     # A pixel of disparity at a focal length of 600 pixels.
     options.mapper.init_min_tri_angle = 0.1
     options.min_model_size, options.extract_colors = 2, False
-    # Adjusted less often on the way, and as well at the end: when a model has grown threefold, with two images beside a
-    # new one, and until the cost changes by less than a thousandth. COLMAP's 1.1, 6, 0 and 0 take twice the time, and
-    # change no error by a tenth.
+    # Fewer adjustments on the way: when a model has grown threefold, with two images beside a new one, and until the
+    # cost changes by less than a thousandth. COLMAP's 1.1, 6, 0 and 0 take twice the time, and change no error by a
+    # tenth.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 3.0
     options.mapper.ba_local_num_images = 2
     options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
@@ -225,7 +225,7 @@ def _map(database: Any, start: tuple[int, int]) -> list[Any]:
 
 
 def _read(model: Any, frames: int) -> Floats:
-    """Poses (frame, 3, 4) in the left camera frame of the first registered frame, NaN of a frame without one."""
+    """Poses (frame, 3, 4) in the left camera frame of the first registered frame, NaN for frames without one."""
     poses, numbers = np.full((frames, 3, 4), np.nan), sorted(model.reg_frame_ids())
     first = model.frame(numbers[0]).rig_from_world
     for number in numbers:
@@ -248,7 +248,7 @@ def crosscheck_stage(
     """Poses of a window of frames by COLMAP, for comparison."""
     from rille.stages.geometry.colmap import pycolmap
 
-    pycolmap.logging.minloglevel = 3  # fatal: what goes wrong is said by the result
+    pycolmap.logging.minloglevel = 3  # fatal alone: the result says what went wrong
     features = list(itertools.chain.from_iterable(zip(left, right, strict=True)))
     with pycolmap.Database.open(":memory:") as database:
         verified = _write_frames(database, rig, features)
@@ -256,8 +256,8 @@ def crosscheck_stage(
         models = _models(database, {left: _near(rig, *points) for left, points in stereo.items()})
     poses, reprojection, reason = np.full((len(frames), 3, 4), np.nan), None, ""
     if models:
-        # Models of one window do not share a frame of reference: the largest is taken. Neighbouring windows may pose
-        # the frames of the others.
+        # Models of one window do not share a frame of reference: the largest is used. Frames of the others may have
+        # poses by neighbouring windows.
         best = max(models, key=lambda m: m.num_reg_frames())
         poses, reprojection = _read(best, len(frames)), float(best.compute_mean_reprojection_error())
     elif verified:

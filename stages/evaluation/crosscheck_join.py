@@ -1,8 +1,8 @@
-"""Windows of the crosscheck to one trajectory, by the frames that they share.
+"""One trajectory of the crosscheck's windows, joined by the frames that they share.
 
-Every window is metric by its baseline, so that a rotation and a translation join two of them; a change of scale would
-hide what the crosscheck is to show. Where windows share no frame with a pose in both, the chain breaks: each piece
-keeps a frame of its own.
+Every window is metric by the baseline, so that a rotation and a translation join two of them; a scale would hide errors
+that the crosscheck is to show. Where windows share no frame with a pose in both, the chain breaks: each piece has its
+own frame of reference.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rille.stages.geometry.rigid import alignment, by_frame, compose, posed
 
 
 def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -> tuple[Floats, NDArray[np.int16]]:
-    """Chain windows in order.
+    """Poses of windows chained in order, and their pieces.
 
     Parameters
     ----------
@@ -29,8 +29,8 @@ def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -
 
     Returns
     -------
-    poses : (frames, 3, 4) T_piece_left; over the shared frames one window fades into the other, so that what they
-        differ by does not look like a jump.
+    poses : (frames, 3, 4) T_piece_left; over the shared frames one window fades into the other, so that their
+        difference does not look like a jump.
     piece : (frames,) number of the piece, -1 where there is no pose.
     """
     poses, piece = np.full((len(frames), 3, 4), np.nan), np.full(len(frames), -1, np.int16)
@@ -40,10 +40,10 @@ def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -
         there = posed(local)
         if not there.any():
             continue
-        # Shared with the piece at hand; frames of an earlier one tie nothing, for that chain is broken.
+        # Shared with the current piece; frames of earlier ones do not join, since that chain is broken.
         shared = there & (piece == number) & (number >= 0)
         if shared.any():
-            # Orientations weigh like positions: over the few metres that windows share they are the better compass.
+            # Orientations weigh like positions: over the few metres that windows share they determine the turn better.
             local = compose(alignment(local[shared], poses[shared], 1.0), local)
             local[shared] = _fade(poses[shared], local[shared])
         else:
@@ -53,12 +53,12 @@ def join(frames: Sequence[int], parts: Sequence[tuple[Sequence[int], Floats]]) -
 
 
 def _fade(earlier: Floats, later: Floats) -> Floats:
-    """Poses (n, 3, 4) that go over from the earlier to the later ones; they differ by little."""
+    """Poses (n, 3, 4) that change gradually from the earlier to the later ones, which differ little."""
     n = len(earlier)
     share = (np.arange(1, n + 1) / (n + 1))[:, None, None]
     out = (1.0 - share) * earlier + share * later
     for pose in out:
-        # A weighted mean of rotations is none, but nearly: the nearest one is taken.
+        # A weighted mean of rotations is nearly a rotation: take the nearest one.
         pose[:, :3] = orthonormal(pose[:, :3])
     return np.asarray(out)
 
@@ -77,7 +77,7 @@ def crosscheck_join_stage(
 ) -> Bundle[JoinFacts]:
     """Windows of the crosscheck to one trajectory."""
     chained, piece = join(frames, [(b.meta["frames"], np.asarray(b["poses"])) for b in windows])
-    # The same of each window that has the frame.
+    # Equal in all windows that have the frame.
     line = np.full(len(frames), np.nan)
     for b in windows:
         line = np.fmax(line, by_frame(np.asarray(b["line_distance"]), b.meta["frames"], frames))

@@ -1,7 +1,7 @@
 """Elevation model against truth: error and completeness together, so that leaving out hard cells is no progress.
 
-Truth is given in the frame of the model, by the true pose of the camera that carries it: a vertical that is off is no
-part of these errors, and stands beside them (``tilt``). Judged are the cells that both cameras see.
+Truth is in the frame of the model, by the true pose of its camera: an error of the vertical is not part of these
+errors, but is given beside them (``tilt``). Cells that both cameras see are judged.
 NMAD = 1.4826 median(\\|e - median(e)\\|) is the robust standard deviation (Hoehle and Hoehle 2009,
 doi:10.1016/j.isprsjprs.2009.02.003).
 """
@@ -26,7 +26,7 @@ ERRORS: Mapping[str, str] = {
     "p95": "95 % of the errors are smaller",
     "bias": "mean elevation error",
 }
-"""Descriptions of the figures of :func:`rille.stages.evaluation.dem_comparison.figures` that are stated."""
+"""Descriptions of the reported figures of :func:`rille.stages.evaluation.dem_comparison.figures`."""
 
 
 def dem_accuracy(elevation: Floats32, std: Floats32, truth: Floats32, judged: Bools) -> dict[str, Metric]:
@@ -53,7 +53,7 @@ def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     if window is None:
         return np.ones(lattice.shape, dtype=bool)
     x_min, y_min, x_max, y_max = window
-    # A centre on the rim counts, whatever it was rounded to.
+    # Centres on the border count, however they are rounded.
     slack, x, y = 1e-6 * lattice.cell, lattice.xs(), lattice.ys()[:, None]
     return (x >= x_min - slack) & (x <= x_max + slack) & (y >= y_min - slack) & (y <= y_max + slack)
 

@@ -1,7 +1,7 @@
-"""What has changed between two elevation models of one place: where, by how much, and with which certainty.
+"""Changes between two elevation models of one place: where, by how much, and how certain.
 
-The standard deviation s of a difference joins those of both models and the effect of a remaining shift by a part of a
-cell on a slope. It is scaled up if most differences spread more, since most of the ground has not changed. A change is
+The standard deviation s of a difference combines those of both models and the effect of a remaining shift by a part of
+a cell on a slope. It is scaled up if most differences spread more, since most of the ground is unchanged. A change is
 a patch of cells that differ in one direction by 2 s, one of them at least by :data:`SURE` s. Its volume is summed over
 the patch and the cells around it. The standard deviation of the volume takes the correlation of neighbouring errors
 from ground that has not changed; a change whose volume is less than :data:`SURE_VOLUME` times that is not listed.
@@ -20,23 +20,23 @@ from rille.stages.numeric.robust import mad_sigma
 from rille.stages.terrain.relief.grid import Grid
 
 SHIFT_CELLS = 0.25
-"""By which the models may still be shifted."""
+"""Cells: remaining shift between the models."""
 
 SURE, BESIDE, SURE_VOLUME = 4.5, 2.0, 3.5
-"""Standard deviations that one cell of a change differs by, all of its cells, and its volume."""
+"""Least standard deviations of one cell of a change, of all its cells, and of its volume."""
 
 FOOT = 2
-"""Cells about a patch in which a change runs out, below what single cells tell."""
+"""Cells around a patch in which a change tapers off, too little for single cells to show."""
 
 BLOCK = 5
-"""Cells: side of the blocks whose means tell how far neighbours share their errors."""
+"""Cells: side of the blocks whose means show how far errors of neighbours correlate."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A patch of ground that rose or fell: its middle, the greatest difference, of either sign, area and volume.
+    """A patch of ground that rose or fell: its centre, its greatest difference of either sign, area and volume.
 
-    The volume is negative where it fell, and has a standard deviation.
+    The volume is negative if it fell, and has a standard deviation.
     """
 
     x_m: float
@@ -49,21 +49,21 @@ class Change:
 
 
 def standard_deviation(error: Floats, sigma: Floats, slope: Floats, cell: float) -> Floats:
-    """Standard deviation (rows, cols), metres, of differences where nothing has changed.
+    """Standard deviation (rows, cols), metres, of differences of unchanged ground.
 
     Parameters
     ----------
     error : (rows, cols) differences, metres, NaN unknown.
-    sigma : (rows, cols) standard deviation of the differences by the models' own account; 0 not known.
+    sigma : (rows, cols) standard deviation of the differences as stated by the models; 0 unknown.
     slope : (rows, cols) metres a metre.
     cell : metres.
     """
-    # Where no model states a standard deviation take the spread of the differences: else flat cells had none.
+    # Where no model states a standard deviation: the spread of the differences, because flat cells would have none.
     known = np.where(np.isfinite(sigma) & (sigma > 0), sigma, mad_sigma(error[np.isfinite(error)]))
     expected = np.hypot(known, SHIFT_CELLS * cell * np.nan_to_num(slope))
     usable = np.isfinite(error) & (expected > 0)
     ratio = error[usable] / expected[usable]
-    # Errors that two models share cancel in the difference; the stated standard deviations are never reduced for that.
+    # Never reduced, although errors that two models share cancel in the difference.
     return np.asarray(expected * max(mad_sigma(ratio) if ratio.size else 1.0, 1.0))
 
 
@@ -92,7 +92,7 @@ def changes(error: Floats, deviation: Floats, grid: Grid) -> list[Change]:
 
 
 def _change(error: Floats, deviation: Floats, patch: Bools, grid: Grid) -> Change:
-    """The change of a patch, of a window of all."""
+    """The change of a patch; all arrays are of one window."""
     difference, area = error[patch], grid.cell**2
     x, y = np.abs(difference) @ grid.centres()[patch] / np.abs(difference).sum()
     greatest = float(difference[np.argmax(np.abs(difference))])
@@ -101,7 +101,7 @@ def _change(error: Floats, deviation: Floats, patch: Bools, grid: Grid) -> Chang
 
 
 def _shared(ratio: Floats, still: Bools) -> float:
-    """Variance of a sum of neighbouring errors over that of as many independent ones; 1 where too little is known."""
+    """Variance of a sum of neighbouring errors over that of as many independent ones; 1 if too few cells are known."""
     rows, cols = (n // BLOCK * BLOCK for n in ratio.shape)
     blocks = [
         a[:rows, :cols].reshape(rows // BLOCK, BLOCK, cols // BLOCK, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK**2)

@@ -1,8 +1,8 @@
-"""One elevation model against another: brought to common cells, aligned if asked, errors by range and slope.
+"""One elevation model against another: on common cells, aligned if asked, errors by range and slope.
 
 The error is A minus the reference B. NMAD = 1.4826 median(|e - median(e)|) is the robust standard deviation (Hoehle and
-Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003). Alignment weighs the differences by Tukey's biweight: what has
-changed between the models must not move them.
+Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003). Alignment weights the differences by Tukey's biweight, so that
+changes between the models do not move them.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ MAX_POINTS = 300_000  # that an alignment uses: six unknowns need no more
 
 
 def cell_means(fine: Grid, target: Grid) -> Floats:
-    """Mean (rows, cols) of the finer cells whose centres lie in each target cell, where they know half of it.
+    """Mean (rows, cols) of the finer cells whose centres lie in each target cell, where half of it is known.
 
-    A centre on the border of two or four target cells counts to each of them alike.
+    A centre on the border of two or four target cells counts for each of them.
     """
     known = np.isfinite(fine.values)
     where, values = target.index(fine.centres()[known]), fine.values[known]
     shape = target.values.shape
     size = shape[0] * shape[1]
     count, total = np.zeros(size), np.zeros(size)
-    # Lattices of which one has twice the cells of the other put centres on borders: rounded to one side, they would
-    # shift the means, or leave every other cell nearly without any. Moved to all four sides, they are shared out.
+    # If one lattice has twice the cells of the other, centres lie on borders: rounded to one side, they would shift the
+    # means, or leave every other cell nearly empty. So each is moved to all four sides.
     # 1e-6 of a coarse cell: a centre nearer than this to a border lies on it.
     for nudge in itertools.product((-1e-6, 1e-6), repeat=2):
         index = np.rint(where + nudge).astype(np.intp)
@@ -64,7 +64,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
         how = f"{name} averaged from {fine.cell:g} m to {target.cell:g} m (half of a cell's area known at least)"
     else:
         values = fine.at(target.centres())
-        # All four, since one model may be turned against the other about one of them.
+        # All four corners, since one model may be turned against the other about one of them.
         corners = fine.index(target.centres()[[0, 0, -1, -1], [0, -1, 0, -1]])
         same = abs(ratio - 1.0) < 1e-9 and np.abs(corners - np.rint(corners)).max() < 1e-6
         how = "the same cells, nothing resampled" if same else f"{name} interpolated bilinearly to the other's cells"
@@ -77,7 +77,7 @@ def common(a: Grid, b: Grid) -> tuple[Grid, Grid, str]:
 
 
 def _outline(grid: Grid) -> str:
-    """Where the known cells of a model lie."""
+    """Extent of the known cells of a model, in words."""
     (x0, y0), (x1, y1) = (edge(grid.centres()[np.isfinite(grid.values)], axis=0) for edge in (np.min, np.max))
     return f"x {x0:.6g}..{x1:.6g}, y {y0:.6g}..{y1:.6g} m"
 
@@ -95,18 +95,17 @@ class Alignment:
 
 
 def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = RigidTransform.identity()) -> Alignment:
-    """Motion that brings A onto B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`): the reference's
-    slopes are known better.
+    """Motion that aligns A with B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`).
 
     Parameters
     ----------
     kind : ``shift`` x, y, z; ``tilt`` z and the inclinations about x and y; ``rigid`` all six.
-    start : T_b_a, about.
+    start : approximate T_b_a.
 
     Raises
     ------
     DegenerateError
-        The terrain does not determine the motion (it is flat for what is asked), or it is not found.
+        The terrain does not determine the motion (it is too flat for this kind), or the fit does not converge.
     """
     free, known = FREE[kind], np.isfinite(b.values)
     points, slopes = b.points()[known], b.slopes()[:, known].T
@@ -125,7 +124,7 @@ def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = RigidTransform.
     covariance[np.ix_(free, free)] = fit.square * np.linalg.inv(normal)
     both = np.kron(np.eye(2), pose.rotation)
     sigma[free] = np.sqrt(np.diag(both @ covariance @ both.T))[free]
-    # Cells at a border that come and go from step to step keep the motion from settling, but within its own errors.
+    # Cells at a border that come and go from step to step keep the motion changing, but within its own errors.
     if fit.rounds == MAX_ROUNDS and (np.abs(fit.step) > sigma).any():
         text = f"no alignment after {MAX_ROUNDS} steps: the last one still moved by {np.abs(fit.step[:3]).max():.2g} m"
         remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"

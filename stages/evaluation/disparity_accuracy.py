@@ -1,8 +1,8 @@
 """Disparities against truth, as stereo benchmarks judge them: errors and completeness, of matches and of all pixels.
 
-Columns alone are compared, which is all that truth of rectified images states. A matcher that leaves out what is hard
-errs less: so all pixels with truth are judged, too, those without a match filled in the usual way of Middlebury and
-KITTI, by the nearest match in their row, of two the background's.
+Column disparities alone are compared, since truth of rectified images has no others. A matcher that leaves out hard
+pixels errs less: so all pixels with truth are judged too, those without a match filled as by Middlebury and KITTI, with
+the nearest match in their row, of two with the background's.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     ----------
     column, truth : (row, col) pixels, right minus left; NaN unknown.
     match : (row, col) pixels with a measured disparity.
-    sigma : (row, col) pixels, standard deviation that is claimed for it.
+    sigma : (row, col) pixels, its claimed standard deviation.
     """
     known = np.isfinite(truth)
     both = known & match & np.isfinite(column)
@@ -59,7 +59,7 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
     # (1, 2, 4): an error beyond these counts as bad: bad-1, bad-2, bad-4.
     for limit in (1, 2, 4):
         words = f"share off by more than {limit} px, "
-        # Not "greater": where nothing is known the error is NaN, and bad.
+        # Not "greater": unknown pixels have the error NaN, and are bad.
         worse = float(np.mean(~(every <= limit))) if every.size else None
         figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
@@ -80,7 +80,7 @@ def disparity_accuracy_stage(
     error = np.where(match, column - true, np.float32(np.nan))
     facts: MetricsFacts = {"metrics": disparity_accuracy(column, match, sigma, true)}
     wrong = facts["metrics"]["bad_2_matched"]["value"]
-    # Of right matches most fit right truth. Of few of them it is not doubted.
+    # Most right matches fit right truth. Fewer than 100 pixels do not raise the doubt.
     if np.count_nonzero(np.isfinite(error)) >= 100 and isinstance(wrong, float) and wrong > 0.75:
         facts["warnings"] = [
             f"the true disparities contradict the matches, of which {1.0 - wrong:.0%} fit them: check truth_disparity: "

@@ -1,10 +1,10 @@
-"""A drive against the truth: how the wheels truly stood, how far the position was off, how long the way was.
+"""A drive against the truth: stands of the wheels, error of the position, length of the path.
 
 Each placement of the simulation (a few millimetres apart), however the drive ended, is judged against the vehicle's
 limits: a belly that strikes, a tilt beyond ``max_slope_deg``, a wheel on an edge above ``max_step``. Positions or paths
-that a failed drive does not have are left out. Positions are compared after making the first pose equal, as everywhere
-(:mod:`rille.stages.evaluation.accuracy`). The shortest way is the planner's on the exact elevations; where its margin,
-which is for what a vehicle does not know, closes every one, it is that within the limits alone.
+that a failed drive does not have are left out. Positions are compared after making the first pose equal, as in
+:mod:`rille.stages.evaluation.accuracy`. The shortest path is the planner's on the exact elevations, with its margin for
+uncertainty; if that leaves none, it is the shortest one within the limits alone.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rille.stages.geometry.geometry import way_length
 
 def judged(drive: Bundle, row: int) -> dict[str, Floats]:
     """Select the placements of a drive up to the image of this row (-1: the last one)."""
-    # What lies behind the last image that was taken was driven, but nothing was known of it.
+    # Placements after the last image were driven, but no estimate knows of them.
     end = int(np.asarray(drive["frame_at"])[row]) + 1
     return {name: np.asarray(drive[name])[:end] for name in ("trail", "tilt", "clearance", "step")}
 
@@ -50,7 +50,7 @@ def placements(parts: Sequence[Mapping[str, Floats]], vehicle: Mapping[str, Any]
 
 
 def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats, dict[str, Metric]]:
-    """Error (frame,) m of the poses (frame, 3, 4), NaN of a frame without one; and that of the last that has one."""
+    """Error (frame,) m of the poses (frame, 3, 4), NaN for frames without one; and metrics of the last one."""
     positions, _ = trajectory_accuracy(estimate, truth)
     error = np.linalg.norm(positions["position"] - positions["position_truth"], axis=1)
     # A drive that ends because tracking is lost has no pose at its last image.

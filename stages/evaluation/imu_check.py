@@ -1,8 +1,8 @@
-"""Whether sensors contradict the images: rates against the camera's rotations, verticals against ground that is seen.
+"""Whether sensors contradict the images: rates against the camera's rotations, verticals against the seen ground.
 
 The sensor's rotation from frame to frame should be that of the images. If it is not, a signed exchange S of its axes,
-or the factor from degrees, is sought by which they agree. At rest only gravity can be compared, and only if the images
-show the ground: several S then fit, because gravity along one axis says nothing of the other two.
+or the factor from degrees, is searched for by which they agree. At rest only gravity can be compared, and only if the
+images show the ground: several S then fit, because gravity along one axis does not determine the other two.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import level_rotation
 from rille.stages.geometry.rigid import posed
 
-# Radians between frames, above which the two disagree; and the share of it that another reading leaves at most.
+# Radians between frames above which the two disagree; and the largest share of them that another reading may leave.
 MIN_DISAGREEMENT, MAX_SHARE = 0.035, 0.3
-# Of a vertical against the normal of the ground: slopes are less, as far as a run's pairs see them.
+# Between a vertical and the normal of the ground: the mean slope that the pairs of a run see is less.
 MAX_SLOPE_DEG = 15.0
 MIN_COSINE = np.cos(np.deg2rad(MAX_SLOPE_DEG))
 UNLESS = "unless all of that ground is such a slope,"
@@ -33,7 +33,7 @@ def signed_axes() -> list[Floats]:
 
 
 def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) -> list[str]:
-    """Warn where the sensor turns otherwise than the images, and say what would fit.
+    """Warnings if the sensor's rotations differ from those of the images, with a reading that would fit.
 
     Parameters
     ----------
@@ -42,20 +42,20 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
     axes : (3, 3) R_imu_left.
     """
     both = posed(images) & posed(sensor)
-    # Behind a gap a sensor's attitude, and a trajectory, may begin anew.
+    # After a gap a sensor's attitude, and a trajectory, may begin anew.
     step = both[:-1] & both[1:]
     if step.sum() < 5:
         return []
     steps = (np.swapaxes(R[:-1][step], 1, 2) @ R[1:][step] for R in (images, sensor))
     seen, sensed = (scipy.spatial.transform.Rotation.from_matrix(step).as_rotvec() @ axes.T for step in steps)
 
-    # A bias turns the sensor, too, by 0.15 rad/s at most; a unit of degrees would make it small.
+    # A bias, at most 0.15 rad/s, also looks like a rotation; read as degrees it would be small.
     fast = np.median(np.linalg.norm(sensed, axis=1)) > MIN_DISAGREEMENT + 0.15 * np.median(np.diff(times)[step])
     readings = list(product((1.0, float(np.deg2rad(1.0))) if fast else (1.0,), signed_axes()))
     off = [float(np.median(np.linalg.norm(factor * sensed @ S.T - seen, axis=1))) for factor, S in readings]
     if off[0] < MIN_DISAGREEMENT or min(off) > MAX_SHARE * off[0]:
         return []
-    # If the camera hardly turns all axes fit alike: then the stated ones are preferred.
+    # If the camera hardly turns, all axes fit alike, and the stated ones are preferred.
     given = [0.1 * off[0] * (S is signed_axes()[0]) for _, S in readings]
     best = int(np.argmin(np.subtract(off, given)))
     factor, S = readings[best]
@@ -69,7 +69,7 @@ def of_rotations(images: Floats, sensor: Floats, times: Floats, axes: Floats) ->
 
 
 def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float | None = None) -> list[str]:
-    """Warn where a stated or measured vertical contradicts the ground that is seen, and say what would fit.
+    """Warnings if a stated or measured vertical contradicts the seen ground, with a reading that would fit.
 
     Parameters
     ----------
@@ -77,14 +77,14 @@ def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float |
     axes : (3, 3) R_imu_left; None: up is not an IMU's.
     pitch : radians; the stated downward pitch over the ground that ``given`` follows from; None: from another source.
     """
-    # Slopes to all sides cancel in the mean of the ground's normals, each in the frame that its own vertical levels.
+    # Slopes in all directions cancel in the mean of the ground's normals, each in the frame levelled by its vertical.
     tilt = np.mean([level_rotation(up) @ ground for up, ground in zip(given, seen, strict=True)], axis=0)
     off = float(np.degrees(np.arctan2(np.hypot(tilt[0], tilt[1]), tilt[2])))
     given, seen = given.mean(axis=0), seen.mean(axis=0)
     if pitch is not None:
         stated, found = np.degrees([pitch, np.arctan2(-seen[2], -seen[1])])
         rest = abs(found + stated)
-        # 5 degrees off a pitch over the ground, so no slope: another sign of it is a cause.
+        # A pitch over the ground excludes a slope: 5 degrees off it may already have the other sign.
         reversed_fits = off > 5.0 and rest < MAX_SHARE * off
         if off <= MAX_SLOPE_DEG and not reversed_fits:
             return []

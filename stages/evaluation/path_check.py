@@ -1,4 +1,4 @@
-"""A planned path against the risk map of the exact elevations: does it cross what is truly hazardous, is it long?"""
+"""A planned path against the risk map of the exact elevations: hazardous cells that it crosses, and its length."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rille.stages.planning.row_graph import UNREACHED
 
 
 def crossed_cells(path: Floats, lattice: Lattice) -> NDArray[np.int64]:
-    """Cells (n, 2) row, column, each once, that a polyline (vertex, x y ...), metres, passes; it may leave the lattice.
+    """Cells (n, 2) row, column, each once, that a polyline (vertex, x y ...), m, crosses; it may leave the lattice.
 
-    The line is sampled at a quarter of a cell, so that it cannot pass more than a cell's corner unseen.
+    The line is sampled at a quarter of a cell, so that it misses no more than a cell's corner.
     """
     along = lengths_along(path[:, :2])
     at = np.linspace(0.0, along[-1], 1 + math.ceil(4.0 * along[-1] / lattice.cell))
@@ -45,7 +45,7 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> dict[str, Metric]
         return {"hazardous_share": share}
     cells = crossed_cells(path, lattice)
     inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
-    # What lies beyond the exact map counts as unknown, like its holes.
+    # Cells outside the exact map count as unknown, like its holes.
     kinds = np.full(len(cells), UNKNOWN, dtype=np.uint8)
     kinds[inside] = risk[cells[inside, 0], cells[inside, 1]]
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
@@ -59,10 +59,10 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> dict[str, Metric]
 
 
 def shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Metric]:
-    """The shortest way between the path's ends over the exact map, and how much longer the path is, from above.
+    """Length of the shortest path between the same ends over the exact map, and how much longer the path is, in plan.
 
-    It is one in steps to the eight neighbours as the path itself is, at no price but its length, where the vehicle
-    keeps its margin from hazards; where that closes every way, the one without it.
+    The shortest path consists of steps to the eight neighbours, as the path itself does; its cost is its length. It
+    keeps the vehicle's margin from hazards, unless that leaves no path.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Where one model lies in another of the same place, by their ortho images: for runs whose world frames differ.
+"""Registration of one model to another of the same place by their ortho images, for runs whose world frames differ.
 
-The keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) that are alike tell it, by the turn and shift
-that most of them agree on. Both images are in metres, so that a scale other than 1 is a wrong place. Under another sun,
-or over ground that was raked, they show no place that both share; the relief does
+Keypoints (SIFT, Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94) are matched, and the turn and shift that most
+matches agree on is the result. Both images are in metres, so that a scale other than 1 is a wrong place. Under another
+sun, or over raked ground, keypoints do not match; then the relief is registered
 (:func:`rille.stages.terrain.map_localization.fix`), and has to be unlike every other place.
 """
 
@@ -27,12 +27,12 @@ FEWEST, MOST_SCALE = 12, 0.03
 
 
 def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
-    """Find where A lies in B, without a start, by the ortho images of both or else their elevations, all in metres.
+    """Placement of A in B, without a start, by the ortho images of both or else their elevations, all in metres.
 
     Raises
     ------
     DegenerateError
-        Neither the images nor the relief tell one place.
+        Neither the images nor the relief determine the place.
     """
     try:
         return place(*images)
@@ -45,7 +45,7 @@ def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement
 
 
 def place(a: Grid, b: Grid) -> Placement:
-    """Where the grey image A lies in the image B, by their keypoints: nothing of height and tilt.
+    """Placement of the grey image A in the image B by keypoints; height and tilt are unknown.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def place(a: Grid, b: Grid) -> Placement:
     arm = p[used] - start
     spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
     sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])
-    # The middle of the matches is known; the origin may be far from it.
+    # The errors are those at the middle of the matches; the origin may be far from it.
     x, y = lever = -turn @ start
     far = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
     kept, covariance = np.ix_([0, 1, 5], [0, 1, 5]), np.diag(np.full(6, math.inf))
@@ -90,7 +90,7 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
     """Similarity (2, 3) on which most matches agree within ``near`` metres, and which of them do."""
     if len(p) < FEWEST:
         return None, np.zeros(len(p), dtype=bool)
-    # OpenCV reckons with 24 binary digits: eastings and northings would lose the centimetres.
+    # OpenCV computes in float32: eastings and northings would lose the centimetres.
     a, b = p.mean(axis=0), q.mean(axis=0)
     motion, used = cv2.estimateAffinePartial2D(p - a, q - b, method=cv2.RANSAC, ransacReprojThreshold=near)
     if motion is None:
@@ -99,7 +99,8 @@ def _agreed(p: Floats, q: Floats, near: float) -> tuple[Floats | None, Bools]:
 
 
 def _described(image: Grid, other: float) -> tuple[Floats, Floats32]:
-    """Places x, y (n, 2) of keypoints, metres, and descriptors (n, 128); in an image no finer than ``other``, m."""
+    """Positions x, y (n, 2), metres, and descriptors (n, 128) of keypoints, in the image coarsened to cells of at least
+    ``other``, m."""
     while other > 1.5 * image.cell:
         image = image.halved()
     grey: AnyArray = np.nan_to_num(image.values.astype(np.float32))
@@ -107,10 +108,10 @@ def _described(image: Grid, other: float) -> tuple[Floats, Floats32]:
     low, high = np.percentile(grey[known > 0], (1, 99)) if known.any() else (0.0, 255.0)
     if low < 0 or high > 255 or high - low < 16.0:  # of other units, or pale
         grey = (grey - low) * (255.0 / max(high - low, 1e-12))
-    # The edge of what is known is no texture: unknown cells get what is around them.
+    # Unknown cells take the values around them, so that their edge is no texture.
     around = [cv2.GaussianBlur(v.astype(np.float32), (0, 0), 4.0) for v in (np.where(known > 0, grey, 0), known)]
     grey = np.where(known > 0, grey, around[0] / np.maximum(around[1], 1e-6))
-    # Without it keypoints lie a part of a cell off their places.
+    # Without enable_precise_upscale keypoints are off by a part of a cell.
     sift = cv2.SIFT.create(8000, enable_precise_upscale=True)
     at, _, descriptors = root_sift(sift, np.clip(grey, 0, 255).astype(np.uint8), known.astype(np.uint8))
     return at @ matrix[:, :2].T + matrix[:, 2], descriptors.astype(np.float32)

@@ -1,13 +1,13 @@
-"""Trajectory against true positions: truth without rotation, of a clock and of a frame of its own.
+"""Trajectory against true positions: truth without rotation, with its own clock and frame.
 
-A GNSS receiver or a total station says where, not how turned. Its frame shares the vertical with the world at most, its
+A GNSS receiver or a total station measures positions alone. Its frame shares at most the vertical with the world; its
 clock may be off by a constant. Truth is therefore moved rigidly in the plane (turned about the vertical and shifted; in
-height it is shifted alone) so that the squared distances are least (Umeyama 1991, doi:10.1109/34.88573), for each
-offset of its clock (:mod:`rille.stages.evaluation.reading.clock`).
+height only shifted) so that the squared distances are least (Umeyama 1991, doi:10.1109/34.88573), for each offset of
+its clock (:mod:`rille.stages.evaluation.reading.clock`).
 
-Where the world's vertical was not measured and the truth has heights, it is moved rigidly in space. What was measured
+If the world's vertical was not measured and the truth has heights, it is moved rigidly in space. The antenna or prism
 may stand off the camera: its lever arm ``l`` in the camera's frame (``P_i + R_i l`` is the antenna) is given, or fitted
-where turns show it. The error is that of the camera, ``P_i - (truth_i - R_i l)``.
+if turns determine it. The error is that of the camera, ``P_i - (truth_i - R_i l)``.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from rille.stages.geometry.rigid import Fit, by_frame, fit_rigid, in_both, rms, 
 from rille.stages.odometry.resection.trajectory import world_poses
 
 MAX_ERROR_SHARE = 0.5
-"""Where other axes, another unit or a lever arm of the truth leave less than this share of the error, it is said."""
+"""Share of the error; if other axes, another unit or a lever arm of the truth leave less, a warning says so."""
 
 MEASURED_VERTICAL = "attitude"
 """Source of the vertical by which heights of truth and world have one direction; ground is not level."""
 
 
 class Comparison(NamedTuple):
-    """True positions (frame, 2 or 3) in the world, NaN where there are none, less the lever arm; figures; warnings;
-    whether they fit the trajectory as they were read."""
+    """True positions (frame, 2 or 3) of the camera in the world, NaN where there are none; metrics; warnings; whether
+    they fit the trajectory as they were read."""
 
     truth: Floats
     metrics: dict[str, Metric]
@@ -49,13 +49,13 @@ class Comparison(NamedTuple):
 def position_accuracy(
     poses: Floats, truth: TruePositions, moments: Floats | None = None, upright: bool = True
 ) -> Comparison:
-    """Compare the estimated positions with true ones, by a lever arm that is fitted where none is stated.
+    """Compare the estimated positions with true ones; a lever arm is fitted if none is stated.
 
     Parameters
     ----------
     poses : (frame, 3, 4) T_world_left, m; NaN where a frame has no pose.
-    truth : positions of a clock and frame of their own; one row a frame where there are no times.
-    moments : (frame,) s, of the images; None where either has no times.
+    truth : positions with their own clock and frame; one row a frame if there are no times.
+    moments : (frame,) s, of the images; None if either has no times.
     upright : whether the world's vertical was measured; else truth with heights is fitted in space.
     """
     without = _compared(poses, truth, moments, upright)
@@ -65,7 +65,7 @@ def position_accuracy(
     lever, rank = fit_lever_arm(poses, without.truth, upright, None if truth.times is None else moments)
     fitted = _compared(poses, replace(truth, lever_arm=lever), moments, upright)
     before, after = (compared.metrics["position_rmse"]["value"] for compared in (without, fitted))
-    # That of a large vehicle is at most 5 m; more is an error of the track.
+    # The lever arm of a large vehicle is at most 5 m; a longer one is an error of the track.
     if not rank or np.linalg.norm(lever) > 5.0 or after is None or after > MAX_ERROR_SHARE * before:
         return without
     x, y, z = lever.round(3) + 0.0
@@ -78,7 +78,7 @@ def position_accuracy(
 
 
 def _compared(poses: Floats, truth: TruePositions, moments: Floats | None, upright: bool) -> Comparison:
-    """The same with the lever arm as it is stated, or none."""
+    """:func:`position_accuracy` with the lever arm as it is stated, or none."""
     arm = poses[:, :, :3] @ (np.zeros(3) if truth.lever_arm is None else truth.lever_arm)
     antenna, there, offset, warnings = poses[:, :, 3] + arm, truth.positions, None, []
     clock = "rows matched to frames one to one"
@@ -103,14 +103,14 @@ def _compared(poses: Floats, truth: TruePositions, moments: Floats | None, uprig
             doubt = _jump(antenna[both, :width], fit.moved[both], upright) or _misfit(fit)
     warnings += [f"true positions {doubt}"] if doubt else []
     where = "in the plane" if upright or width == 2 else "in space, since the vertical was not measured"
-    # Of the camera, as the estimate is; where it has no pose, of the antenna.
+    # Position of the camera, like the estimate; of the antenna where the camera has no pose.
     moved = fit.moved - np.nan_to_num(arm[:, :width])
     figures = _figures(poses[:, :, 3], moved, f"positions only, after a rigid fit {where}, {clock}")
     return Comparison(moved, figures | (_clock(offset) if offset else {}), warnings, not doubt)
 
 
 def _jump(antenna: Floats, truth: Floats, upright: bool) -> str:
-    """That few steps of the true positions (n, 2 or 3) depart from the antenna's, and explain most of what is left."""
+    """Warning if few steps of the true positions (n, 2 or 3) depart from the antenna's and make most of the error."""
     off = np.diff(truth - antenna, axis=0)
     jumps = standing_out(np.linalg.norm(off, axis=1))
     steady = truth.copy()
@@ -125,7 +125,7 @@ def _jump(antenna: Floats, truth: Floats, upright: bool) -> str:
 
 
 def _misfit(fit: Fit) -> str:
-    """That what the best fit leaves is no error of an estimate."""
+    """Warning if the best fit leaves more than an estimate's error."""
     if fit.relative < MUCH:
         return ""
     text = f"do not fit the trajectory: {fit.error:.2g} m RMS are left, {fit.relative:.0%} of both extents"
@@ -133,7 +133,7 @@ def _misfit(fit: Fit) -> str:
 
 
 def _otherwise(truth: Floats) -> dict[str, Floats]:
-    """Truth (frame, 2 or 3) as it would be if its axes or its unit were others, by the words that say so."""
+    """Truth (frame, 2 or 3) with other axes or another unit, by their description."""
     mirrored = truth * np.array([1.0, -1.0, 1.0])[: truth.shape[1]]
     readings = {"mirrored: x and y may be swapped; seen from above y lies left of x": mirrored}
     readings |= {f"in units of {unit:g} m: state truth.unit = {unit:g}": unit * truth for unit in UNITS}
@@ -157,7 +157,7 @@ def _figures(estimate: Floats, truth: Floats, how: str) -> dict[str, Metric]:
     error = (estimate[:, :width] - truth)[both]
     away = np.linalg.norm(error, axis=1)
     first, last = np.flatnonzero(both)[[0, -1]]
-    # With the truth of frames between that have no pose: the true path leads on there.
+    # With frames between that have no pose, since the true path goes on there.
     whole = truth[first : last + 1]
     length, drift = over_length(float(np.linalg.norm(error[-1] - error[0])), whole, f"error of the way, {how}")
     return figures | {

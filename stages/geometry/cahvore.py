@@ -32,7 +32,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bending:
-    """What a lens does to rays: optical axis O (unit length), radial terms R, entrance pupil E (m), linearity L."""
+    """Distortion of a lens: optical axis O (unit length), radial terms R, entrance pupil E (m), linearity L."""
 
     axis: Vector
     radial: Vector = (0.0, 0.0, 0.0)
@@ -40,14 +40,14 @@ class Bending:
     linearity: float = 1.0
 
     def bend(self, points: Floats) -> Floats:
-        """Directions (n, 3) p'' of points (n, 3) relative to C; NaN beyond what the lens sees."""
+        """Directions (n, 3) p'' of points (n, 3) relative to C; NaN for points outside the field of view."""
         o = np.asarray(self.axis)
         along = points @ o
         across = points - along[:, None] * o
         far = np.linalg.norm(across, axis=1)
         with np.errstate(all="ignore"):
             chi = self._chi(self._angle(along, far))
-            # On the axis the direction across is 0 / 0.
+            # On the axis the direction across would be 0 / 0.
             central = far <= 1e-12 * np.abs(along)  # no direction across: the point itself
             scaled = np.where(central, along, far / np.where(central, 1.0, chi))
             factor = 1.0 + _even(self.radial, np.where(central, 0.0, chi))
@@ -72,7 +72,7 @@ class Bending:
         # Derivative of (1 + mu(x)) x in powers of x squared: where it vanishes, pixels turn back inwards.
         roots = np.roots([5.0 * r[2], 3.0 * r[1], 1.0 + r[0]]) if any(r) else np.empty(0)
         real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
-        # A tangent ends at a quarter turn, and a sine turns back there.
+        # A tangent is infinite at a quarter turn, and a sine decreases beyond it.
         limit = math.pi if self.linearity == 0 else 0.5 * math.pi / abs(self.linearity)
         if not real.size:
             return limit
@@ -124,12 +124,12 @@ class Bending:
 
 
 def _newton(step: Callable[[Floats], Floats], start: Floats) -> Floats:
-    """The zero by Newton's ``step``; each doubles the digits of a start that is right to some percent."""
+    """The zero by Newton's ``step``, which doubles the right digits of a start that is good to some percent."""
     x = start
     for _ in range(30):
         off = step(x)
         x = x - off
-        # Radians, or shares of a radius.
+        # Absolute below 1 radian or radius, relative above.
         if not (np.abs(off) > 1e-14 * np.maximum(1.0, np.abs(x))).any():
             break
     return x

@@ -1,4 +1,4 @@
-"""pycolmap without its handler of SIGTERM, which would print a stack trace of C++ in place of what Python does."""
+"""pycolmap without its handler of SIGTERM, which would print a stack trace of C++ instead of running Python's."""
 
 import ctypes
 import signal

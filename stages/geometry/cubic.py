@@ -10,12 +10,12 @@ from numba import njit
 def cubic(a, x, y):  # type: ignore[no-untyped-def]
     """Catmull-Rom value (float32) of an image ``a`` at (x, y), a pixel or more inside."""
     whole_x, whole_y = np.int64(x), np.int64(y)
-    # Unsigned indices need no check for counting from the end.
+    # Unsigned indices need no check for negative ones.
     i, j, step = np.uint64(whole_x), np.uint64(whole_y), np.uint64(1)
     t, s = np.float32(x) - np.float32(whole_x), np.float32(y) - np.float32(whole_y)
     left, right, far = i - step, i + step, i + step + step
     above, below, bottom = j - step, j + step, j + step + step
-    # Constants of type float32: with Python's own numba would compute in float64, and round otherwise.
+    # Constants of type float32: with Python's floats numba would compute in float64.
     h, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
     three, four, five = np.float32(3.0), np.float32(4.0), np.float32(5.0)
     w0, w3 = h * t * (two * t - one - t * t), h * t * t * (t - one)

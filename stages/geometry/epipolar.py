@@ -1,15 +1,14 @@
 """Epipolar distances of matches, corrections of the rig, and the effect of corrections on depth.
 
-A correction of a rig has five parameters, all zero for the rig as it is given; the length of the baseline is not one of
-them, for no image shows it. ``pitch``, ``yaw``, ``roll`` (radians) turn the right camera about the x, y and z axis of
-its own given frame, its centre held; ``baseline_across`` and ``baseline_forward`` (radians, to first order) swing that
-centre about the left camera's, across the baseline in the image plane and along the optical axis.
+A correction of a rig has five parameters, all zero for the rig as given; the length of the baseline is not one of them,
+since no image shows it. ``pitch``, ``yaw``, ``roll`` (radians) turn the right camera about the x, y and z axis of its
+given frame, its centre held; ``baseline_across`` and ``baseline_forward`` (radians, to first order) turn that centre
+about the left camera's, across the baseline in the image plane and along the optical axis.
 
 The residual is the distance of the right point from the epipolar line of the left one, in pixels of the right image:
 the first-order (Sampson) error of a correspondence whose left pixel is exact, as it is in a disparity map of the left
-image (Hartley and Zisserman 2004, section 11.4.3). On a usual rig it is the row offset: positive where the right
-image's content lies below its line; where one camera stands above the other it is the column offset, positive to the
-right.
+image (Hartley and Zisserman 2004, section 11.4.3). On a usual rig it is the row offset, positive if the right point
+lies below the line; on a rig with one camera above the other it is the column offset, positive to the right.
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, le
 from rille.stages.geometry.projection import product
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
-"""The five parameters of a correction, in the order of every vector of them."""
+"""The five parameters of a correction, in their order in vectors."""
 
 MAX_LINE_DISTANCE_PX = 2.0
-"""A match this near its epipolar line lies on it. Of two images of a street that are one frame apart .22 to .32 of the
-matches do so, of simultaneous ones .95 to .98; on a desert up to .08, and .99."""
+"""Distance from its epipolar line up to which a match lies on it: in a street .95 to .98 of the matches of simultaneous
+images, .22 to .32 of images one frame apart; in a desert .99, and up to .08."""
 
 
 def standing(rig: Rig) -> bool:
-    """Whether one camera stands above the other: epipolar lines run down the image then, and not along its rows."""
+    """Whether one camera stands above the other, so that epipolar lines run along columns instead of rows."""
     return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
 
 
@@ -48,7 +47,7 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
     """
     if not np.any(correction):
         return rig
-    # Turned in its own frame, the centre stays; the translation then follows from both.
+    # The turn keeps the centre; the translation follows from both.
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     centre, _ = _centre(rig, correction)
     return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
@@ -67,9 +66,9 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     """
     centre, swings = _centre(rig, correction)
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
-    # A line of the image with matrix K is K^-T times the normal R (c x ray) of the plane of sight.
+    # A line of the image with matrix K is K^-T times the normal R (c x ray) of the epipolar plane.
     to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
-    # Not at 0: the fit comes back to large corrections, where turns do not commute.
+    # Not at 0: for large corrections, which the fit reaches, turns do not commute.
     turns = left_jacobian(correction[:3])
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
@@ -86,14 +85,14 @@ def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: igno
         x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
         line = product(to_line, x, y)
         length = np.sqrt(line[0] ** 2 + line[1] ** 2)
-        # A line has no sense of its own: its normal points down the image, or to the right where it is steep.
+        # The normal of a line points down the image, or to the right if the line is steep.
         if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
             length = -length
         d = (u * line[0] + v * line[1] + line[2]) / length
         distance[n], slopes[n, 5], slopes[n, 6] = d, line[0] / length, line[1] / length
         for p in range(5):
             a, b, c = product(to_slopes[p], x, y)
-            # Quotient rule: the line's normal changes its length as well.
+            # Quotient rule: the length of the line's normal changes too.
             slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
 
 
@@ -101,13 +100,13 @@ def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, 
     """Inverse depth 1/Z (n,) along the left camera's axis, 1/m, and its change per pixel of disparity (n,).
 
     With p_r ~ Z m + epipole, m = K_r R r, the offset from the epipole is linear in 1/Z; the part of the disparity
-    across the epipolar line says nothing on depth and is left out.
+    across the epipolar line does not depend on depth and is left out.
     """
     to_right = rig.right.matrix @ rig.T_right_left.rotation
     epipole = rig.right.matrix @ rig.T_right_left.translation
     m = rig.left.rays(pixels) @ to_right.T
     p = pixels + disparity
-    # Direction of the epipolar line at p, in homogeneous coordinates: right also where the epipole lies at infinity.
+    # Direction of the epipolar line at p; homogeneous coordinates allow an epipole at infinity.
     along = p * epipole[2] - epipole[:2]
     offset = p * m[:, 2:] - m[:, :2]
     # At the epipole itself there is no line.
@@ -118,10 +117,10 @@ def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, 
 
 
 def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
-    """Compute the matrix ``G`` (5, 5): a correction ``c`` (5,) changes depth by ``sqrt(c^T G c)`` (relative RMS).
+    """Matrix ``G`` (5, 5): a correction ``c`` (5,) changes depth by ``sqrt(c^T G c)`` (relative RMS).
 
-    Points count as precisely as stereo measures their depth, so that near ones decide, as they do in navigation.
-    A turn of the right camera by 0.01 degrees across 27 px of mean disparity and 707 px of focal length makes 0.45 %.
+    Points are weighted by the precision of their depth, so that near ones decide, as they do in navigation. At a mean
+    disparity of 27 px and a focal length of 707 px a yaw of the right camera by 0.01 degrees makes 0.45 %.
     """
     rho, per_pixel = inverse_depth(rig, left, right - left)
     slopes = np.empty((len(left), 5))
@@ -131,7 +130,7 @@ def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
         ahead, _ = inverse_depth(corrected(rig, step), left, right - left)
         behind, _ = inverse_depth(corrected(rig, -step), left, right - left)
         slopes[:, i] = (ahead - behind) / (2 * step[i])
-    # In pixels of disparity, which stereo measures alike near and far.
+    # In pixels of disparity, whose errors are the same near and far.
     scaled = slopes / per_pixel[:, None]
     weighted = np.einsum("ni,nj->ij", scaled, scaled)
     total = float(np.sum((np.maximum(rho, 0.0) / per_pixel) ** 2))
@@ -139,19 +138,19 @@ def depth_sensitivity(rig: Rig, left: Floats, right: Floats) -> Floats:
 
 
 def beyond_infinity(rig: Rig, left: Floats, right: Floats) -> Floats:
-    """How far (n,) points lie beyond infinity, pixels of disparity; negative for points in front of the cameras."""
+    """Distances (n,) of points beyond infinity, pixels of disparity; negative for points in front of the cameras."""
     rho, per_pixel = inverse_depth(rig, left, right - left)
     return np.asarray(-rho / per_pixel, dtype=np.float64)
 
 
 MAX_IMAGE_TURN_DEG = 45.0
-"""Turn of the right image against the rig [degrees] above which the image was turned, and not its mount."""
+"""Turn of the right image against the rig [degrees] above which the image was turned, not the camera."""
 
 
 def image_turn(rig: Rig, left: Floats, right: Floats) -> float:
-    """Degrees by which the right image is turned in its plane, clockwise as one sees it, against what the rig says.
+    """Degrees by which the right image is turned in its plane, clockwise in the image, against the rig.
 
-    ``left``, ``right``: (n, 2) matches, column and row. Depth and lens change it by little.
+    ``left``, ``right``: (n, 2) matches, column and row. Depth and lens change the angle little.
     """
     seen = [points - np.median(points, axis=0) for points in (left, right)]
     here, there = (points @ (1.0, 1.0j) for points in seen)
@@ -160,7 +159,7 @@ def image_turn(rig: Rig, left: Floats, right: Floats) -> float:
 
 
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
-    """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two swings."""
+    """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two turns."""
     unit = rig.centre / np.linalg.norm(rig.centre)
     axis = np.array([1.0, 0.0, 0.0]) if standing(rig) else np.array([0.0, 1.0, 0.0])
     across = axis - unit * float(unit @ axis)

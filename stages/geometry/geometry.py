@@ -1,6 +1,6 @@
 """Cameras, rigid transforms and the paper's rotation angles.
 
-Conventions, said once for the whole project:
+Conventions of the whole project:
 
 * pixel centres are at integer coordinates; ``(column, row) = (0, 0)`` is the centre of the top left pixel;
 * ``T_dst_src`` maps coordinates: ``x_dst = R x_src + t``;
@@ -24,7 +24,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
-"""Width and height of the left and of the right images, pixels; two cameras need not be alike."""
+"""Width and height of the left and of the right images, pixels; they may differ."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class RigidTransform:
-    """``x_dst = rotation @ x_src + translation``; the name of a variable says which frames (``T_dst_src``)."""
+    """``x_dst = rotation @ x_src + translation``; names of variables state the frames (``T_dst_src``)."""
 
     rotation: Floats
     translation: Floats
@@ -95,14 +95,14 @@ class RigidTransform:
             raise InputError("RIL-331", f"a rigid transform needs 3 x 3 and 3 numbers, not {r.shape} and {t.shape}")
         if not (np.isfinite(r).all() and np.isfinite(t).all()):
             raise InputError("RIL-332", "a rigid transform has a value that is not finite")
-        # Large entries first, whose product would overflow; 1e-4 lets poses written with five digits pass.
+        # Large entries first, because their product would overflow; 1e-4: for poses written with five digits.
         if np.abs(r).max() > 2 or np.abs(r @ r.T - np.eye(3)).max() > 1e-4 or np.linalg.det(r) < 0:
             raise InputError(
                 "RIL-333",
                 "a pose's 3 x 3 part is not a rotation",
                 remedy="give rows of [R | t] with R orthonormal and det R = +1",
             )
-        # A frozen class shares its arrays: a change in place would change every transform that holds them.
+        # Read-only, since several transforms may share one array.
         r.setflags(write=False)
         t.setflags(write=False)
         object.__setattr__(self, "rotation", r)
@@ -193,7 +193,7 @@ def heading_of(T: RigidTransform) -> float:
 
 
 def from_above(T: RigidTransform) -> tuple[float, float, float]:
-    """Place x, y (m) and heading (rad, see :func:`heading_of`) of a frame."""
+    """Position x, y (m) and heading (rad, see :func:`heading_of`) of a frame."""
     return float(T.translation[0]), float(T.translation[1]), heading_of(T)
 
 
@@ -213,7 +213,7 @@ def rotation_exp(w: ArrayLike) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues)."""
     v = np.asarray(w, dtype=np.float64)
     angle = np.sqrt((v * v).sum(-1))
-    # Both limits at 0, without dividing by it.
+    # The limits at an angle of 0, without dividing by it.
     safe = np.where(angle < 1e-9, 1.0, angle)
     a = np.where(angle < 1e-9, 1.0, np.sin(safe) / safe)[..., None, None]
     b = np.where(angle < 1e-9, 0.5, (1.0 - np.cos(safe)) / safe**2)[..., None, None]
@@ -243,7 +243,7 @@ def left_jacobian(w: Floats) -> Floats:
 
 def orthonormal(matrix: ArrayLike) -> Floats:
     """The nearest rotation to a 3 x 3 matrix (polar decomposition)."""
-    # The determinant in the middle keeps a reflection out.
+    # The determinant excludes a reflection.
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
@@ -251,9 +251,9 @@ def orthonormal(matrix: ArrayLike) -> Floats:
 def level_rotation(up_in_camera: ArrayLike) -> Floats:
     """Rotation R_level_cam of the levelled frame: z up, y ahead, x right.
 
-    Ahead is the horizontal projection of the optical axis. Of a camera within 10 degrees of straight down, whose axis
-    points to where a mount or a gust tilts it, it is that of the image's upper edge (straight up: the lower one). From
-    10 to 30 degrees the one passes into the other, so that no heading jumps.
+    Ahead is the horizontal projection of the optical axis. For a camera within 10 degrees of straight down, whose axis
+    has no stable heading, it is that of the direction to the image's upper edge (straight up: the lower edge). From 10
+    to 30 degrees the two are blended, so that the heading does not jump.
 
     Parameters
     ----------
@@ -261,8 +261,7 @@ def level_rotation(up_in_camera: ArrayLike) -> Floats:
     """
     z = np.asarray(up_in_camera, dtype=np.float64)
     z = z / np.linalg.norm(z)
-    # Length of the axis' horizontal projection; the edge's weight is as long, so that the turn from one to the other is
-    # even.
+    # Length of the axis' horizontal projection; the vector to the edge is as long, so that the blending is even.
     aside = float(np.hypot(z[0], z[1]))
     axis = float(np.interp(math.degrees(math.asin(min(aside, 1.0))), (10.0, 30.0), (0.0, 1.0)))
     forward = np.array([0.0, math.copysign((1.0 - axis) * max(aside, 0.1), z[2]), axis])

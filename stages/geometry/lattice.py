@@ -1,8 +1,8 @@
-"""Regular lattice of cell centres that elevation models lie on.
+"""Regular lattice of cell centres for elevation models.
 
 All lattices of one cell size are parts of one infinite lattice: cell centres are at *integer multiples* of the cell, so
-two models of one frame overlap cell by cell and merge without resampling (a registration error of half a cell would
-move landmarks by as much as the disparity's own noise). Row 0 lies at the greatest y, as in a map with north up.
+two models of one frame overlap cell by cell and merge without resampling (an offset of half a cell would move landmarks
+by as much as the noise of the disparity). Row 0 lies at the greatest y, as in a map with north up.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from rille.stages.core.errors import ConfigError, InputError
 Window = tuple[slice, slice]
 
 MAX_CELLS = 50_000_000
-"""Most cells of one lattice: a float32 array of it takes 200 MB, and a stage holds a handful."""
+"""Most cells of one lattice: a float32 array of them takes 200 MB, and a stage holds several."""
 
 
 @dataclass(frozen=True)
 class Lattice:
     """Cell centres ``x = x0 + col * cell``, ``y = y0 - row * cell``, metres, of a local or the world frame.
 
-    ``x0`` and ``y0`` are put on the exact product of an integer and ``cell``, so equal cells have equal coordinates
-    in every lattice that holds them.
+    ``x0`` and ``y0`` are rounded to the exact product of an integer and ``cell``, so that equal cells have equal
+    coordinates in every lattice.
 
     Raises
     ------
@@ -63,14 +63,14 @@ class Lattice:
             )
         for name, value in (("x0", self.x0), ("y0", self.y0)):
             index = value / self.cell
-            # Far from the origin a float's rounding is a visible part of a cell.
+            # 1e-3: far from the origin rounding of the float is a part of a cell.
             if not math.isfinite(index) or abs(index - round(index)) > 1e-3:
                 raise InputError("RIL-357", f"lattice origin {name}={value} is no multiple of the cell {self.cell}")
             object.__setattr__(self, name, round(index) * self.cell)
 
     @staticmethod
     def at(i0: int, j0: int, cell: float, rows: int, cols: int) -> Lattice:
-        """From the integer indices of the first cell: ``x0 = i0 * cell``, ``y0 = j0 * cell``."""
+        """Lattice by the integer indices of its first cell: ``x0 = i0 * cell``, ``y0 = j0 * cell``."""
         return Lattice(i0 * cell, j0 * cell, cell, rows, cols)
 
     @staticmethod
@@ -79,7 +79,7 @@ class Lattice:
         x_min, x_max, y_min, y_max = (float(v) for v in bounds)
         assert x_min <= x_max
         assert y_min <= y_max
-        slack = 1e-6  # a bound on a cell's border does not ask for the next cell
+        slack = 1e-6  # a bound on a cell's border does not add the next cell
         low = [math.floor(v / cell + 0.5 + slack) for v in (x_min, y_min)]
         high = [math.ceil(v / cell - 0.5 - slack) for v in (x_max, y_max)]
         high = [max(pair) for pair in zip(low, high, strict=True)]
@@ -92,7 +92,7 @@ class Lattice:
 
     @property
     def j0(self) -> int:
-        """Integer line of the first cell: ``y0 / cell``."""
+        """Integer row of the first cell, counted upwards: ``y0 / cell``."""
         return round(self.y0 / self.cell)
 
     @property
@@ -119,7 +119,7 @@ class Lattice:
         return np.arange(self.i0, self.i0 + self.cols, dtype=np.float64) * self.cell
 
     def ys(self) -> Floats:
-        """Coordinate y (rows,) of the cell centres, metres, falling."""
+        """Coordinate y (rows,) of the cell centres, metres, decreasing."""
         return np.arange(self.j0, self.j0 - self.rows, -1, dtype=np.float64) * self.cell
 
     def xy(self) -> Floats:
@@ -141,7 +141,7 @@ class Lattice:
         return Lattice.at(i0, j0, self.cell, j0 - j1, i1 - i0)
 
     def intersection(self, other: Lattice) -> Lattice | None:
-        """The cells that both have; None where they do not overlap."""
+        """Lattice of the cells that both have; None if they do not overlap."""
         self._same_cell(other)
         i0, j0 = max(self.i0, other.i0), min(self.j0, other.j0)
         cols = min(self.i0 + self.cols, other.i0 + other.cols) - i0
@@ -159,8 +159,8 @@ class Lattice:
     def tiles(self, size: int) -> Iterator[Lattice]:
         """Tiles of at most ``size`` x ``size`` cells, from the top left.
 
-        Tile borders are at multiples of ``size`` of the infinite lattice: a tile inside stays the same one when the
-        lattice grows, so what is computed on it stays valid.
+        Tile borders are at multiples of ``size`` of the infinite lattice: inner tiles, and the results on them, stay
+        valid when the lattice grows.
         """
         for top in _cuts(-self.j0, self.rows, size):
             for left in _cuts(self.i0, self.cols, size):
@@ -186,23 +186,22 @@ class Lattice:
 
 def _cuts(first: int, count: int, size: int) -> list[tuple[int, int]]:
     """(start, length) of the pieces of ``first .. first + count`` between multiples of ``size``."""
-    # Multiples of the size on the infinite lattice, so that a tile does not move when the map grows at its edge.
     edges = [first, *range((first // size + 1) * size, first + count, size), first + count]
     return [(a, b - a) for a, b in itertools.pairwise(edges)]
 
 
 def union(lattices: Iterable[Lattice]) -> Lattice:
-    """Smallest lattice that holds all given ones (at least one)."""
+    """Smallest lattice that holds all of ``lattices`` (at least one)."""
     return reduce(Lattice.union, lattices)
 
 
 def mosaic(parts: Sequence[tuple[Lattice, NDArray[Any]]], nodata: float, target: Lattice | None = None) -> NDArray[Any]:
-    """Assemble arrays (rows, cols) on lattices that do not overlap; cells of no part are ``nodata``.
+    """Assemble arrays (rows, cols) on several lattices; cells of no part are ``nodata``.
 
     Parameters
     ----------
     parts : lattice and array of each part, all of one dtype. Where parts overlap, the later one wins.
-    nodata : value of the cells that no part has (NaN for floats).
+    nodata : value of cells without a part (NaN for floats).
     target : lattice of the result; default: the union of the parts.
     """
     whole = target or union(lattice for lattice, _ in parts)

@@ -4,14 +4,14 @@ Models and the order of their coefficients are OpenCV's:
 
 * ``none``: no coefficients;
 * ``radtan`` (Brown 1966, Conrady 1919): k1 k2 p1 p2 [k3];
-* ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4 [tx ty]]: then its thin prism, and the tilt of the sensor;
+* ``rational``: k1 k2 p1 p2 k3 k4 k5 k6 [s1 s2 s3 s4 [tx ty]] (s: thin prism, t: tilt of the sensor);
 * ``fisheye`` (Kannala, Brandt 2006, doi:10.1109/TPAMI.2006.153): k1 k2 k3 k4; Kalibr calls it equidistant.
 
-One more is that of NASA's rovers, see :mod:`rille.stages.geometry.cahvore`:
+One more model is that of NASA's rovers, see :mod:`rille.stages.geometry.cahvore`:
 
 * ``cahvore``: skew (pixels of row by a unit of x), optical axis O (3), R (3), linearity; for far points, so without E.
 
-Raw pixels are those of the image as it was taken; ideal pixels those of a pinhole camera in its place.
+Raw pixels are those of the image as it was taken, ideal pixels those of a pinhole camera at the same place.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
     "fisheye": (4,),
     "cahvore": (8,),
 }
-"""How many coefficients each model takes."""
+"""Numbers of coefficients that each model may have."""
 
 CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
@@ -47,7 +47,7 @@ CHUNK_POINTS = 65536
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as it is built: ``camera`` is its pinhole part (pixels of the raw image), the rest its distortion."""
+    """A camera with distortion: ``camera`` is its pinhole part (pixels of the raw image)."""
 
     camera: Camera
     model: str = "none"
@@ -77,10 +77,10 @@ class Lens:
     def ideal_camera(self) -> Camera:
         """The pinhole camera of the undistorted image: same size and principal point as the raw one.
 
-        It has the raw focal length, so that the centre keeps its resolution, except for a fisheye: there the pinhole's
-        edges are far inside the raw image, and the focal length is shortened until the middle of each raw edge is seen,
-        but no further than to .7, so that half of the pixels at the centre stay. What lies beyond (more than 60 degrees
-        off the axis) is lost.
+        It has the raw focal length, so that the centre keeps its resolution, except for a fisheye: there the edges of
+        that image would lie far inside the raw one, and the focal length is reduced until the middle of each raw edge
+        is seen, at most to .7, which keeps half of the pixels at the centre. The rest (more than 60 degrees off the
+        axis) is lost.
         """
         c = self.camera
         if self.model != "fisheye" and not (self.model == "cahvore" and self._bending.linearity < 1):
@@ -89,16 +89,16 @@ class Lens:
         edges = np.array([[0.0, c.cy], [w, c.cy], [c.cx, 0.0], [c.cx, h]])
         far = np.hypot(*((self.undistort(edges, c) - [c.cx, c.cy]).T))
         room = np.array([c.cx, w - c.cx, c.cy, h - c.cy])
-        # an edge without ideal position is 90 degrees off the axis or more
+        # An edge without ideal position is 90 degrees off the axis or more.
         ratio = np.where(np.isfinite(far), room / np.maximum(far, 1e-9), 0.0)
         factor = float(np.clip(ratio.min(), 0.7, 1.0))
         return replace(c, fx=factor * c.fx, fy=factor * c.fy)
 
     @cached_property
     def reach(self) -> float:
-        """Tangent of the angle off the axis up to which the radial model grows; beyond it, it folds back."""
+        """Tangent of the angle off the axis up to which the radial model is monotonic; beyond, it folds back."""
         k = self.coefficients
-        if self.model in ("none", "cahvore"):  # which knows by itself
+        if self.model in ("none", "cahvore"):  # cahvore has its own limit
             return math.inf
         if self.model == "fisheye":
             angle = _first_root(Polynomial([1.0, *((2 * n + 3) * v for n, v in enumerate(k))]))
@@ -115,7 +115,7 @@ class Lens:
         return Bending((ox, oy, oz), (r0, r1, r2), linearity=linearity)
 
     def distort(self, points: ArrayLike, ideal: Camera | None = None) -> Floats:
-        """Raw pixels of ideal ones.
+        """Raw pixels of ideal pixels.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class Lens:
     def undistort(self, points: ArrayLike, ideal: Camera | None = None) -> Floats:
         """Ideal pixels of raw ones: the inverse of :meth:`distort`.
 
-        OpenCV's fixed-point iteration, which stalls under strong distortion, polished by Newton steps.
+        By OpenCV's fixed-point iteration, which stalls under strong distortion, then Newton steps.
 
         Returns
         -------
@@ -151,7 +151,7 @@ class Lens:
         rays = np.column_stack([self._start(raw), np.ones(len(raw))])
         with np.errstate(all="ignore"):
             todo = np.arange(len(raw))
-            for _ in range(10):  # steps of Newton double the digits, and the start is right to a pixel
+            for _ in range(10):  # each step doubles the right digits; the start is good to a pixel
                 here = self._project(rays[todo])
                 # A millionth of a pixel: far below what any match resolves.
                 unsolved = ~(np.hypot(*(here - raw[todo]).T) < 1e-6)
@@ -232,8 +232,8 @@ def _points(points: ArrayLike) -> Floats:
 
 
 def _first_root(in_square: Polynomial) -> float:
-    """Least r > 0 where a polynomial in r squared vanishes; infinite where it does not."""
-    # A smaller coefficient moves no point of any image, and its root lies beyond all of them.
+    """Least zero r > 0 of a polynomial in r squared; infinite if there is none."""
+    # 1e-12: smaller coefficients move no point of an image, and their roots lie outside of it.
     roots = in_square.trim(1e-12).roots()
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(1.0, np.abs(roots))) & (roots.real > 0)]
     return math.sqrt(float(real.min())) if real.size else math.inf

@@ -9,9 +9,9 @@ from rille.stages.core.declare import Array
 NO_VERTICAL = "none"
 """Source of the vertical if nothing gives it: z is then the camera's own up."""
 GROUND_PLANE = "ground plane"
-"""Source of the vertical where the ground gives it that the images show."""
+"""Source of the vertical if it is the normal of the seen ground."""
 REFERENCE_PLANE = "reference plane"
-"""Source of the vertical where elevations are distances from a plane that is no ground: z is its normal."""
+"""Source of the vertical if elevations are distances from a plane other than the ground: z is its normal."""
 
 POSES = Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan")
 

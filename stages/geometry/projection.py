@@ -52,8 +52,8 @@ def rotated(R, v):  # type: ignore[no-untyped-def]
 
 @register_jitable
 def product(m, x, y):  # type: ignore[no-untyped-def]
-    """``M (x, y, 1)`` as three numbers: of a homography the place that it maps x, y to, times the third number, which
-    is positive on this side of the horizon; of a fundamental matrix the line ``a x' + b y' + c = 0`` of x, y."""
+    """``M (x, y, 1)`` as three numbers: for a homography the homogeneous point that it maps x, y to, with a positive
+    third number on this side of the horizon; for a fundamental matrix the line ``a x' + b y' + c = 0`` of x, y."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2],
         m[1, 0] * x + m[1, 1] * y + m[1, 2],
@@ -65,7 +65,7 @@ def product(m, x, y):  # type: ignore[no-untyped-def]
 def linearise(camera, x, along, pixel, j):  # type: ignore[no-untyped-def]
     """Fill ``j`` (2, 8): derivatives of a projection by ``v`` and ``w`` (6), by a shift ``along``; and its error.
 
-    ``x``, ``along``: three numbers each in the camera frame; ``pixel`` (2): where the point was seen.
+    ``x``, ``along``: three numbers each in the camera frame; ``pixel`` (2): the measured point.
     """
     z, w = x[2], along[2]
     u, v = x[0] / z, x[1] / z

@@ -1,9 +1,9 @@
-"""Sets of camera poses [R | t] (..., 3, 4): products, errors, lengths, and the motion that brings one set to another.
+"""Sets of camera poses [R | t] (..., 3, 4): products, errors, lengths, and the motion that aligns one set with another.
 
-Positions alone do not say how far a straight drive is rolled about its own line, nor anything of a resting camera's
-attitude. For an alignment by both, each pose counts as seven points: its centre, and the ends of three crossed rods of
-half length ``lever`` along its axes; the points are brought together by least squares (Umeyama 1991,
-doi:10.1109/34.88573, without scale).
+Positions alone do not determine the roll about a straight drive, nor the attitude of a camera at rest. For an alignment
+by positions and orientations each pose counts as seven points: its centre, and the ends of three crossed rods of half
+length ``lever`` along its axes; the points are aligned by least squares (Umeyama 1991, doi:10.1109/34.88573, without
+scale).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rille.stages.core.arrays import Bools, Floats
 
 
 def posed(poses: Floats) -> Bools:
-    """Which of the poses (frame, 3, 4), or other matrices, are there, i.e. without NaN."""
+    """Which of the poses (frame, 3, 4), or other matrices, are known, i.e. without NaN."""
     return np.asarray(np.isfinite(poses).all(axis=(1, 2)))
 
 
@@ -38,7 +38,7 @@ def compose(a: Floats, b: Floats) -> Floats:
 
 def inverse(T: Floats) -> Floats:
     """Inverses (..., 3, 4) of rigid transforms."""
-    # The transpose instead of a general inverse: no rounding enters the rotation.
+    # The transpose, unlike a general inverse, rounds no number of the rotation.
     R = np.swapaxes(T[..., :3], -1, -2)
     return np.concatenate([R, -R @ T[..., 3:]], axis=-1)
 
@@ -49,7 +49,7 @@ def motion(poses: Floats, first: Any, last: Any) -> Floats:
 
 
 def steps(P: Floats, Q: Floats) -> tuple[Floats, Floats]:
-    """Motions (n, 3, 4) of P and Q (frame, 3, 4) between successive frames, of those alone that both have."""
+    """Motions (n, 3, 4) of P and of Q (frame, 3, 4) between those successive frames that both have."""
     p, q = (motion(T, slice(None, -1), slice(1, None)) for T in (P, Q))
     both = posed(p) & posed(q)
     return p[both], q[both]
@@ -73,30 +73,30 @@ def angles_between(a: Floats, b: Floats) -> Floats:
 
 
 def rms(vectors: Floats) -> float:
-    """Root of the mean squared length of vectors (n, k); NaN of none."""
+    """Root of the mean squared length of vectors (n, k); NaN for none."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else float("nan")
 
 
 def lengths_along(positions: Floats) -> Floats:
-    """Length (frame,), m, of the way from the first of positions (frame, 2 or 3), straight over gaps."""
-    # Interpolated over frames without a position, so that the way of every frame is a number to search in.
+    """Length (frame,), m, of the path from the first of positions (frame, 2 or 3), straight over gaps."""
+    # Interpolated over frames without a position, so that the lengths can be searched.
     rows = np.flatnonzero(np.isfinite(positions).all(axis=1))
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions[rows], axis=0), axis=1))])
     return np.asarray(np.interp(np.arange(len(positions)), rows, lengths))
 
 
 def umeyama(source: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """Rotation (k, k) and translation (k,) that bring points (n, k) nearest to others in the least-squares sense."""
+    """Rotation (k, k) and translation (k,) that align points (n, k) with others by least squares."""
     a, b = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - b).T @ (source - a))
-    # Else positions on a plane or a line may be fitted best by a reflection.
+    # A reflection may fit positions on a plane or a line best.
     u[:, -1] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = u @ vt
     return rotation, b - rotation @ a
 
 
 class Fit(NamedTuple):
-    """Positions ``moved`` (n, 2 or 3), m; ``error``: RMS that is left, m; ``relative``: that over both sets' extent."""
+    """Positions ``moved`` (n, 2 or 3), m; ``error``: RMS residual, m; ``relative``: that over both sets' extent."""
 
     moved: Floats
     error: float
@@ -106,8 +106,8 @@ class Fit(NamedTuple):
 def fit_rigid(target: Floats, source: Floats, upright: bool = True) -> Fit:
     """Positions ``source`` (n, 2 or 3) turned and shifted to those of ``target`` (n, 3), m.
 
-    They are turned about the vertical alone where both are ``upright``, i.e. have one vertical, and where the source
-    has no heights. Rows of NaN in either do not count, but are moved as well.
+    They are turned about the vertical alone if both are ``upright``, i.e. share the vertical, or if the source has no
+    heights. Rows that are NaN in either do not count, but are moved as well.
     """
     width = source.shape[1]
     both = in_both(target, source)
@@ -118,19 +118,19 @@ def fit_rigid(target: Floats, source: Floats, upright: bool = True) -> Fit:
     turned = 2 if upright else width
     b[:, :turned] = b[:, :turned] @ umeyama(b[both, :turned], a[both, :turned])[0].T
     error = rms(a[both] - b[both])
-    # Against the extent of both sets: else the offset wins that compares the fewest, nearest frames.
+    # Relative to the extent of both sets: else clock offsets that compare few, near frames have the least error.
     extent = np.hypot(rms(a[both]), rms(b[both]))
     return Fit(b + centre, error, float(error / extent) if extent > 0 else np.inf)
 
 
 def standing_out(lengths: Floats, least: float = 0.0) -> Bools:
-    """Which lengths (n,) are above ten times their median and ``least``, as of jumps; none where three in ten are."""
+    """Which lengths (n,) exceed ten times their median and ``least``, as jumps do; none if three in ten do."""
     far = lengths > max(10.0 * float(np.median(lengths)), least)
     return np.asarray(far & (far.mean() < 0.3))
 
 
 def in_both(a: Floats, b: Floats) -> Bools:
-    """Rows (n,) that are there, i.e. without NaN, in both sets of positions (n, 2 or 3)."""
+    """Rows (n,) that are known, i.e. without NaN, in both sets of positions (n, 2 or 3)."""
     return np.asarray(np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1))
 
 
@@ -140,10 +140,10 @@ def spread(poses: Floats) -> float:
 
 
 def alignment(source: Floats, target: Floats, share: float) -> Floats:
-    """Motion (3, 4) that brings poses (n, 3, 4), from the left, nearest to others of the same frames.
+    """Motion (3, 4) that aligns poses (n, 3, 4), from the left, with others of the same frames.
 
-    ``share`` is the lever over the spread of the target's positions: how much orientations count beside positions.
-    A camera at rest has no spread but noise; infinity lets the orientations alone decide.
+    ``share`` is the lever over the spread of the target's positions: the weight of orientations against positions. For
+    a camera at rest, whose spread is noise, infinity lets the orientations alone decide.
     """
     lever = share * spread(target)
     if lever < 1e-6 or not np.isfinite(lever):
@@ -155,5 +155,5 @@ def alignment(source: Floats, target: Floats, share: float) -> Floats:
 def _points(poses: Floats, lever: float) -> Floats:
     centre = poses[:, None, :, 3]
     rods = lever * np.swapaxes(poses[:, :, :3], 1, 2)
-    # Both ends of each rod: their mean is the centre, so that rods pull no position aside.
+    # Both ends of each rod, so that their mean is the centre.
     return np.concatenate([centre, centre + rods, centre - rods], axis=1).reshape(-1, 3)

@@ -1,8 +1,8 @@
 """Whether the matches of a pair fit its rig, fit it with the sides exchanged, or fit no rig at all.
 
-With parallel cameras exchanged images lie beyond infinity; with cameras turned inward they need not, but their rows
-then depart the wrong way towards the corners. A match therefore fits the rig if it lies near its epipolar line *and*
-in front of the cameras.
+With parallel cameras, matches of exchanged images lie beyond infinity. With convergent cameras they need not, but their
+rows then differ from the epipolar lines towards the corners. A match therefore fits the rig if it lies near its
+epipolar line *and* in front of the cameras.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rille.stages.geometry.scale import right_pixels
 
 
 def fits(rig: Rig, left: Floats, right: Floats, tolerance: float = MAX_LINE_DISTANCE_PX) -> float:
-    """Share of the matches (n, 2), (n, 2) that lie within ``tolerance``, pixels of the coarser image, of their epipolar
-    lines, ahead."""
+    """Share of the matches (n, 2), (n, 2) in front of the cameras and within ``tolerance``, pixels of the coarser
+    image, of their epipolar lines."""
     tolerance *= right_pixels(rig)
     off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -29,14 +29,14 @@ def fits(rig: Rig, left: Floats, right: Floats, tolerance: float = MAX_LINE_DIST
 def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float]:
     """Whether left and right are exchanged; shares of the matches that fit the rig as given, and the other way."""
     as_given, other_way = fits(rig, left, right), fits(rig, right, left)
-    # Most of the matches fit the other way, and twice as many as the given one.
+    # Most of the matches fit the other way, and more than twice as many as fit the given one.
     return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
 
 
 def refuse_mirrored(rig: Rig, left: Floats, right: Floats) -> None:
     """Refuse matches that fit the rig only once the images of both cameras are mirrored top to bottom.
 
-    Nothing shows it where baseline and axes lie in one plane.
+    If baseline and axes lie in one plane, nothing shows it.
     """
     back = [points * [1.0, -1.0] + [0.0, of.height - 1.0] for of, points in ((rig.left, left), (rig.right, right))]
     if max(exchanged(rig, left, right)[1:]) < 0.4 and fits(rig, back[0], back[1]) > 0.8:
@@ -45,9 +45,9 @@ def refuse_mirrored(rig: Rig, left: Floats, right: Floats) -> None:
 
 
 def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
-    """Refuse matches of which most lie ``beyond`` infinity (share), or fit the rig mirrored or with its sides swapped.
+    """Refuse matches of which most lie beyond infinity (share ``beyond``), or fit the rig mirrored or sides swapped.
 
-    Parallel cameras see everything beyond infinity with their sides exchanged, others on wrong lines.
+    With sides swapped, matches of parallel cameras lie beyond infinity, those of others on wrong lines.
     """
     refuse_mirrored(rig, left, right)
     swapped, as_given, other_way = exchanged(rig, left, right)

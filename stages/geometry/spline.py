@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rille.stages.core.arrays import Floats32
 
 TAPS_RADIUS_PX = 10
-"""Pixels to either side that a coefficient depends on; what is cut off is about a thousandth of a grey level."""
+"""Pixels to either side that a coefficient depends on; the cut changes about a thousandth of a grey level."""
 
 POLE = math.sqrt(3.0) - 2.0
 TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(TAPS_RADIUS_PX + 1))
@@ -26,8 +26,8 @@ TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(TAPS_RADIUS_PX + 1))
 def coefficients(image: ArrayLike) -> Floats32:
     """Coefficients (row, col) float32 of the cubic spline through the pixels of an image (row, col).
 
-    The image goes on mirrored at its borders. Those of a window are the image's to the bit, :data:`TAPS_RADIUS_PX`
-    pixels in from where it is cut.
+    The image is mirrored at its borders. Coefficients of a window equal the image's to the bit, :data:`TAPS_RADIUS_PX`
+    pixels or more from the cut.
     """
     grey = np.asarray(image, np.float32)
     mirrored = cv2.copyMakeBorder(grey, *4 * (TAPS_RADIUS_PX,), cv2.BORDER_REFLECT_101)
@@ -73,7 +73,7 @@ def slopes(t):  # type: ignore[no-untyped-def]
 def value_and_gradient(spline, x, y):  # type: ignore[no-untyped-def]
     """Value of a spline, by its coefficients (row, col), at a point, and its derivatives along x and y; float32.
 
-    The point lies at 1 <= x < cols - 2, and y alike: a spline reads from one pixel before to two behind it.
+    The point lies at 1 <= x < cols - 2, and y alike: a spline reads from one pixel before to two after it.
     """
     i, j = np.uint32(x), np.uint32(y)
     t, s = x - np.float32(i), y - np.float32(j)

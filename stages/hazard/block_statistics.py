@@ -1,7 +1,7 @@
 """An elevation model reduced to blocks of n x n cells: extremes, known cells, noise, and differences of heights.
 
-Measures of places far apart, or of means over a window, are computed on blocks. No cell is left out, since a block
-keeps its highest and its lowest height and whole sums.
+Measures that compare distant cells, or take means over a window, are computed on blocks. No cell is left out, since a
+block keeps its highest and its lowest height and whole sums.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rille.stages.core.arrays import Floats, Floats32
 
 
 class Blocks(NamedTuple):
-    """Arrays (row, col) of blocks: ``high`` and ``low`` float32 m, NaN where nothing is known; sums float64:
+    """Arrays (row, col) of blocks: ``high`` and ``low`` float32 m, NaN where no cell is known; sums float64:
 
     ``known``: number of known cells, ``variance``: their squared standard deviations (m2), ``pairs``: cells ``lag``
     apart along either axis, counted at both ends, and ``deviation``: their squared differences (m2).
@@ -36,8 +36,8 @@ def reduce_to_blocks(surface: Floats32, closed: Floats32, std: Floats32, n: int,
 
     Parameters
     ----------
-    closed : the surface with holes closed; cells are counted, with their standard deviation ``std``, on it.
-    n, lag : side of a block, and distance of the cells that are compared, cells.
+    closed : the surface with holes closed, whose cells are counted, with their standard deviation ``std``.
+    n, lag : side of a block, and distance of the compared cells, cells.
     """
     high, low = (reduce(extreme, _of_blocks(surface, n, np.nan)) for extreme in (np.fmax, np.fmin))
     known = ~np.isnan(closed)

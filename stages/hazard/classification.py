@@ -1,18 +1,18 @@
-"""Measures compared with the limits of a vehicle, cell by cell: class, reasons, probability, and a raster of each.
+"""Compare measures with the limits of a vehicle, cell by cell: class, reasons, probability, and a raster of each.
 
 For a measure V with limit L, bias b and spread d per metre of the elevations' standard deviation s, and k ``sigmas``:
 
-    load   = (V + max(0, k d - b) s) / L         hazardous above 1; V carries the bias already, so k d - b more is added
+    load   = (V + max(0, k d - b) s) / L         hazardous above 1; V contains the bias b s, so k d - b more is added
     excess = (V - b s - L) / (d s')              s' = s above the limit, else s widened by what unknown ground may hide
 
-A cell's class follows from its greatest load, ``p_hazard = F(greatest excess)`` from its greatest excess: all measures
-look at one ground, so they err together. ``p_wheel`` is F of the greatest excess of the measures of the wheel's window:
-whether a wheel meets an edge does not depend on how the vehicle would stand there. F is Student's t, since matching
-errs grossly now and then, steeper about the limit (:data:`LIFT`). With ``k d >= b``, which is enforced, more noise is
-never safer.
+A cell's class follows from its greatest load, ``p_hazard = F(greatest excess)`` from its greatest excess, since
+measures of the same ground err together. ``p_wheel`` is F of the greatest excess of the measures of the wheel's window:
+whether a wheel meets an edge does not depend on how the vehicle would stand there. F is Student's t, because of
+occasional gross errors of matching, steeper about the limit (:data:`LIFT`). With ``k d >= b``, which is enforced, more
+noise is never safer.
 
-The measures on blocks are judged on blocks. A cell starts with the load and the excess of its block; then each measure
-on cells is compared with its limit.
+Measures on blocks are compared first. A cell starts with the load and the excess of its block; then each measure on
+cells is compared with its limit.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ UNKNOWN_BIT, FILLED_BIT, DOUBT_BIT, UNSEEN_BIT = 1 << 7, 1 << 8, 1 << 9, 1 << 10
 
 
 HIDDEN_STEPS = 0.5
-"""Steps of the vehicle by which unknown ground widens the doubt of a measure, where all of the wheel's window, or of
-the ground below the vehicle, is unknown: the measure does not hold what is hidden there."""
+"""Standard deviation that entirely unknown ground in the wheel's window, or below the vehicle, adds to a measure, in
+units of ``max_step``."""
 
 STEPS_PER_EXCESS = 64
-"""Steps of the table of F a unit of excess."""
+"""Steps of the table of F for one unit of excess."""
 
 MAX_EXCESS = 16.0
 """Excess where the table of F ends."""
 
 LIFT = 0.8
-"""What t is raised by: a measure at its limit is more often above it than below, since a matcher smooths relief away
-more often than it makes some. Fitted, as where it begins, with the noise of :mod:`rille.stages.hazard.measures`; F
-stays a rising function."""
+"""Added to t near and above the limit: a measure at its limit is more often above it than below, since a matcher
+smooths relief away more often than it adds some. Fitted, like the excess where it begins, with the noise of
+:mod:`rille.stages.hazard.measures`; F remains an increasing function."""
 
 
 NO_BITS = np.uint16(0)
@@ -111,13 +111,13 @@ def classify(
 
     Parameters
     ----------
-    filled : (row, col) 1 where a hole of the elevation was closed.
+    filled : (row, col) 1 where a hole of the elevation model was closed.
     measures : rows of the table, at least one on cells and one on blocks.
     """
     share, patchy, n = terrain.known_share(), terrain.places.unstood, terrain.stride
     values = {m.name: m.kernel(terrain) for m in measures}
     noise = np.stack([terrain.window_noise(), terrain.footprint_noise()])
-    # In proportion to the unknown share, and of a step, since anything higher shows at the rim of the known ground.
+    # In proportion to the unknown share and to a step, since higher objects show at the rim of the known ground.
     hidden = np.float32(HIDDEN_STEPS * terrain.vehicle.max_step)
     doubt = np.hypot(noise, hidden * np.stack([1.0 - np.minimum(share, 1.0), patchy]))
     flags = np.where((share < 0.999) | (patchy > 0), np.uint16(UNSEEN_BIT), NO_BITS)
@@ -131,7 +131,7 @@ def classify(
     wide = np.stack([spread(a) for a in noise]), np.stack([spread(a) for a in doubt])
 
     def judged(*, below: bool) -> Verdicts:
-        """Verdicts (row, col) by the measures of a wheel's window, or of all ground below the vehicle."""
+        """Verdicts (row, col) of the measures in a wheel's window, or of all ground below the vehicle."""
         on_cells, on_blocks = (
             [(m, values[m.name]) for m in measures if (m.on_blocks, m.below) == (kind, below)] for kind in (False, True)
         )
@@ -141,7 +141,7 @@ def classify(
     wheel, body = judged(below=False), judged(below=True)
     load, excess = np.maximum(wheel.load, body.load), np.maximum(wheel.excess, body.excess)
     over, p, p_wheel = wheel.over | body.over, _chance(excess), _chance(wheel.excess)
-    # A hazard that is proven by a part of the window stays one, however little is known.
+    # A hazard in the known part of a window is one, however small that part is.
     known = ~np.isnan(terrain.closed)
     hazardous = known & (load > 1)
     unknown = ~(hazardous | (known & (spread(share) >= params.min_known)))
@@ -164,20 +164,20 @@ def _judged(
     values: Sequence[tuple[Measure, Floats32]],
     spreads: tuple[AnyArray, AnyArray],
 ) -> Verdicts:
-    """Measures against the vehicle's limits, added to what was judged before.
+    """Verdicts of more measures against the vehicle's limits, together with those ``before``.
 
-    ``spreads`` (window, row, col): standard deviation, and the same widened by what may be hidden, metres, in the
-    wheel's window and below the vehicle.
+    ``spreads`` (window, row, col): standard deviation, and the same with that of unknown ground, metres, in the wheel's
+    window and below the vehicle.
     """
     (load, excess, over), f = before, np.float32
     for m, value in values:
         length, limit = m.length(terrain), f(m.greatest(terrain.vehicle))
         bias, spread = m.bias / length, m.spread / length
         noise, doubt = (maps[int(m.below)] for maps in spreads)
-        # A measure already carries the bias of its extrema, so only the rest of the standard deviations is added.
+        # A measure already contains the bias of its extrema, so only the rest of the standard deviations is added.
         own = (value + f(max(0.0, sigmas * spread - bias)) * noise) / limit
         above = value - f(bias) * noise - limit
-        # Hidden ground can only raise a measure, so it makes no hazard less certain.
+        # Unknown ground can only raise a measure, so it makes no hazard less certain.
         std = np.where(above > 0, noise, doubt)
         load = np.maximum(load, own)
         # The second term keeps the excess of exact elevations finite.
@@ -203,10 +203,10 @@ def _chance(excess: Floats32) -> Floats32:
 def _table() -> Floats32:
     """F (entry,) at steps of the excess."""
     t = np.arange(-MAX_EXCESS * STEPS_PER_EXCESS, MAX_EXCESS * STEPS_PER_EXCESS + 1) / STEPS_PER_EXCESS
-    # t is raised from an excess of -0.4 on, and to the whole of it over another 0.6.
+    # The lift begins at an excess of -0.4 and is full 0.6 above.
     raised = np.clip((t + 0.4) / 0.6, 0.0, 1.0)
     # Three degrees of freedom.
     chance = scipy.special.stdtr(3.0, t + LIFT * raised)
-    # Beyond the ends of the table the probability counts as certain, whatever the tails of Student's t.
+    # Beyond the table 0 and 1, without the tails of Student's t.
     chance[0], chance[-1] = 0.0, 1.0
     return np.asarray(chance, dtype=np.float32)

@@ -1,25 +1,25 @@
-"""Measures of hazard, one row each of :data:`MEASURES`: each has its own limit of a vehicle, and none is blended.
+"""Measures of hazard, the rows of :data:`MEASURES`; each is compared with its own limit of the vehicle.
 
 To add a measure, write its kernel, ``(HazardInput) -> array``, and add its row: classification, reasons, raster,
 messages and the probability of a hazard loop over the table. Inputs are an elevation model with its standard deviations
 and the vehicle; outputs are metres or gradients, float32 without NaN. The first three measures are those of the paper
-(section 4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`); the last three put the vehicle
-down at every place and heading (:mod:`rille.stages.hazard.placement`). Roughness is the RMS deviation
-``sqrt(mean((z(x + d) - z(x))^2) / 2)`` over both axes: the standard deviation of ground without slope, and little of a
-slope's (Shepard et al. 2001, doi:10.1029/2000JE001429).
+(section 4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`); the last three place the vehicle
+at every position and heading (:mod:`rille.stages.hazard.placement`). Roughness is the RMS deviation
+``sqrt(mean((z(x + d) - z(x))^2) / 2)`` over both axes: on level ground the standard deviation of the heights, and it
+increases little with slope (Shepard et al. 2001, doi:10.1029/2000JE001429).
 
 **Greater relief is never safer.** Every measure is a rising function of differences of heights, ``max(0, hi - lo)``
 with ``hi`` and ``lo`` highest, lowest or median heights of parts of the window, or ``\\|z_i - z_j\\|``. Suppose that of
 any two cells of a window the higher one is raised at least as much as the lower one (a rock grows on level ground; the
-highest part is raised). Then the order of the heights stays, so the same cells are picked, and none of these
-differences shrinks. A least-squares plane has no such property: a rock that grows uphill or downhill of its centre
-levels the plane. So no measure is a fit.
+highest part is raised). Then the order of the heights stays, the same cells are selected, and none of these differences
+decreases. A least-squares plane has no such property: a rock that grows uphill or downhill of its centre levels the
+plane. So no measure is a fit.
 
-**Noise.** Extrema of n noisy heights lie beyond the true ones, and the more so the flatter the ground is. With ``s``
-the RMS standard deviation of the heights that a measure V looks at, V has the bias ``bias * s`` and the standard
-deviation ``spread * s``. The factors were found on simulated pairs, seeds 101 to 106, on 21 November 2026
-(``benchmarks/hazards.py``). They are far below those of independent heights, because errors of a matcher are alike over
-some cells; the last three measures look at places far apart, whose errors are less alike.
+**Noise.** Extrema of n noisy heights lie beyond the true ones, most on flat ground. With ``s`` the RMS standard
+deviation of the heights of a measure V, V has the bias ``bias * s`` and the standard deviation ``spread * s``. The
+factors were fitted to simulated pairs, seeds 101 to 106, on 21 November 2026 (``benchmarks/hazards.py``). They are far
+below those of independent heights, because errors of a matcher correlate over some cells; the last three measures
+compare distant places, whose errors correlate less.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ from rille.stages.numeric.extrema import median3, relief
 from rille.stages.numeric.windows import window_sum
 
 MIN_FINE_CELLS = 5
-"""Cells along a wheel's radius from which a 3 x 3 median is taken: at most three wrong cells are no stone there."""
+"""Fewest cells along a wheel's radius for a 3 x 3 median: up to three wrong cells are too small for a stone there."""
 
 
 class HazardInput:
-    """An elevation model and a vehicle; derived arrays are computed once, when a measure asks for them.
+    """An elevation model and a vehicle; derived arrays are computed once, when first used.
 
     Parameters
     ----------
     surface : (row, col) float32, metres, NaN unknown.
-    closed : the same with small holes closed. A closed cell counts as known and with its noise, but its height between
-        other heights proves no relief.
-    std : (row, col) float32 of ``closed``, metres, 0 where it is not known.
+    closed : the same with small holes closed. A closed cell counts as known, with its noise, but its interpolated
+        height adds no relief.
+    std : (row, col) float32 of ``closed``, metres, 0 where unknown.
     cell : side of a cell, metres.
     window : side of the wheel's window, metres.
     """
@@ -58,7 +58,7 @@ class HazardInput:
     def __init__(
         self, surface: Floats32, closed: Floats32, std: Floats32, cell: float, vehicle: Vehicle, window: float
     ) -> None:
-        # Of coarser models a single cell may be the top of a stone.
+        # In coarser models a single cell may be the top of a stone.
         fine = MIN_FINE_CELLS * cell <= 0.5 * vehicle.wheel_diameter * (1.0 + 1e-6)
         self.surface = median3(surface) if fine else surface
         self.closed, self.std, self.cell, self.vehicle = closed, std, cell, vehicle
@@ -77,14 +77,14 @@ class HazardInput:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Extremes and sums of blocks of ``stride`` x ``stride`` cells; cells a quarter of a wheel apart compared."""
+        """Extremes and sums of blocks of ``stride`` x ``stride`` cells; ``lag`` is a quarter of a wheel."""
         lag = max(1, round(0.25 * self.vehicle.wheel_diameter / self.cell))
         return reduce_to_blocks(self.surface, self.closed, self.std, self.stride, lag)
 
     @cached_property
     def places(self) -> Places:
-        """The vehicle put down with its middle on every block."""
-        # Counts are sums in floating point.
+        """The vehicle placed with its centre on every block."""
+        # 0.5: counts are floating-point sums.
         whole = self.blocks.known > self.stride**2 - 0.5
         return place(self.blocks.high, self.blocks.low, self.vehicle, self.stride * self.cell, whole)
 
@@ -99,7 +99,7 @@ class HazardInput:
 
     def footprint_noise(self) -> Floats32:
         """RMS standard deviation (row, col) of the blocks' heights below the vehicle, metres."""
-        # Mean of both halves: the window serves all headings.
+        # Mean of half length and half width, since the window serves all headings.
         half = self.vehicle.half_length + self.vehicle.half_width
         return _rms(self.blocks.variance, self.blocks.known, 2 * round(half / (2.0 * self.stride * self.cell)) + 1)
 
@@ -110,7 +110,7 @@ class HazardInput:
 
 
 def _rms(squares: Floats, count: Floats, side: int) -> Floats32:
-    # Running sums of squares may fall below zero by their rounding.
+    # Running sums of squares may be negative by rounding.
     mean = np.maximum(window_sum(squares, side), 0.0) / np.maximum(window_sum(count, side), 1.0)
     return np.sqrt(mean).astype(np.float32)
 
@@ -136,13 +136,12 @@ def _wheel_distance(terrain: HazardInput) -> float:
 class Measure(NamedTuple):
     """One measure of hazard.
 
-    ``bit`` of ``reason``, for good: a bit never changes its meaning. ``kernel`` gives metres or gradients, float32
-    without NaN: of the cells, or ``on_blocks`` of :attr:`HazardInput.stride` cells. ``limit`` is the parameter of the
-    vehicle; a limit in degrees makes the measure a gradient. ``bias`` and ``spread`` of its heights by noise are
-    divided by ``length``, metres, to be those of the measure. ``below``: it looks at all ground below the vehicle
-    rather than at the wheel's window, so it is a hazard to the vehicle's middle rather than to a wheel. ``words`` name
-    it in messages, ``band`` and ``description`` its raster, which holds radians, metres, or with ``left`` the metres
-    that remain to the limit.
+    ``bit`` of ``reason``, which never changes its meaning. ``kernel`` returns metres or gradients, float32 without NaN:
+    of cells, or ``on_blocks`` of :attr:`HazardInput.stride` cells. ``limit`` is the parameter of the vehicle; with a
+    limit in degrees the measure is a gradient. ``bias`` and ``spread`` are those of heights; divided by ``length``,
+    metres, those of the measure. ``below``: it is a measure of all ground below the vehicle, not of the wheel's window,
+    and so a hazard to the vehicle's centre, not to a wheel. ``words`` name it in messages, ``band`` and ``description``
+    its raster, which holds radians, metres, or with ``left`` the metres that remain to the limit.
     """
 
     name: str
@@ -208,9 +207,9 @@ BITS = {m.name: m.bit for m in MEASURES}
 WHEEL_BITS = np.uint16(sum(m.bit for m in MEASURES if not m.below))
 """Hazards to a wheel on the cell."""
 BODY_BITS = np.uint16(sum(m.bit for m in MEASURES if m.below))
-"""Hazards to the vehicle with its middle on the cell."""
+"""Hazards to the vehicle with its centre on the cell."""
 
 
 def window_reach(side: float, cell: float) -> int:
-    """Cells from the middle of a window to its border, the nearest number, halves rounded down; at least one."""
+    """Cells from the middle of a window to its border, rounded, halves down; at least one."""
     return max(1, math.ceil(side / (2.0 * cell) - 0.5 - 1e-6))

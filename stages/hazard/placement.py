@@ -1,19 +1,19 @@
-"""A vehicle put down on the ground at every place and heading: tilt, slope of the footprint and rise under the belly.
+"""A vehicle placed on the ground at every position and heading: tilt, slope of the footprint, rise under the belly.
 
-Places lie on a coarse grid, every seventh of a wheel; heights are first reduced to the highest and the lowest of each
-of its blocks, so that nothing is left out. A wheel *stands* on the highest ground in its contact patch, half a wheel
-wide; *ground* is the lowest there. At each place the vehicle is turned through ``HEADINGS`` headings. Four wheels touch
-in threes: of each three, two span the wheel base and two the track, so the plane through them has the gradient
-(difference along a side / wheel base, difference along an axle / track). The greatest over threes and headings is
+Positions lie on a coarse grid, at every seventh of a wheel; heights are first reduced to the highest and the lowest of
+each of its blocks, so that none is left out. A wheel *stands* on the highest ground in its contact patch, half a wheel
+wide; *ground* is the lowest there. At each position the vehicle takes ``HEADINGS`` headings. Three of four wheels touch
+the ground: two of them span the wheel base and two the track, so the plane through them has the gradient (difference
+along a side / wheel base, difference along an axle / track). The greatest over triples of wheels and headings is
 
 * tilt, from where the wheels stand (stones count), and
 * slope of the footprint's plane, from the ground beneath (stones narrower than a wheel do not).
 
-Rise under the belly is how far the ground there comes up from the plane of the wheels: for a point p between the axles
+Rise under the belly is the height of the ground there over the plane of the wheels: for a point p between the axles
 with bilinear weights w of the four wheels, ``sum_i w_i max(0, z(p) - stand_i)``. It is the height of p over that plane
-where no wheel stands higher than p, and more where one does: a wheel that happens to stand high lifts the belly, but is
-not relied on, as in the bounds of Otsu et al. (2020), doi:10.1002/rob.21917 (ACE). On a plane of gradient g it is at
-most g wheel_base / 4 along, and as much across with the track.
+if no wheel stands higher than p, else more: a wheel that stands high lifts the belly, but that is not relied on, as in
+the bounds of Otsu et al. (2020), doi:10.1002/rob.21917 (ACE). On a plane of gradient g it is at most g wheel_base / 4
+along, and g track / 4 across.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from rille.stages.numeric.extrema import running_max
 Ints = NDArray[np.int64]
 
 HEADINGS = 8
-"""Over half a turn, since the footprint is the same backwards: 22.5 degrees move a wheel by less than its diameter."""
+"""Headings over half a turn, since the footprint is symmetric; 22.5 degrees move a wheel by less than its diameter."""
 
 
 class Places(NamedTuple):
     """Results (row, col) on the coarse grid, float32: gradients ``tilt`` and ``slope`` (1), ``rise`` (m).
 
-    ``unstood``: of wheels and parts of the belly, over headings, the share with unknown ground below; what is there is
-    not in the others.
+    ``unstood``: share of wheels and parts of the belly, over headings, with unknown ground below, which is not in the
+    others.
     """
 
     tilt: Floats32
@@ -64,7 +64,7 @@ class Stance(NamedTuple):
 
     @staticmethod
     def of(vehicle: Vehicle, cell: float) -> Stance:
-        """Compute the offsets for a vehicle on a grid with cells of ``cell`` metres."""
+        """Offsets for a vehicle on a grid with cells of ``cell`` metres."""
         # Order of the wheels in all arrays: front left, front right, rear left, rear right.
         half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
         wheels = half * [vehicle.wheel_base, vehicle.track]
@@ -79,14 +79,13 @@ class Stance(NamedTuple):
         at = np.stack([np.rint(wheels @ turn / cell) for turn in turns])
         under = np.stack([np.rint(points @ turn / cell) for turn in turns])
         pairs = ((0, 2), (1, 3), (0, 1), (2, 3))
-        # From the wheels' rounded places, not the vehicle's sides: a plane of gradient g then measures g at any
-        # heading.
+        # By the wheels' rounded positions, not the vehicle's sides, so that a plane of gradient g has g at any heading.
         spans = np.stack([np.hypot(*(at[:, a] - at[:, b]).T) for a, b in pairs], axis=1) * cell
         part = max(vehicle.wheel_base / parts[0], width / parts[1])
         return Stance(
             at.astype(np.int64),
             under.astype(np.int64),
-            # Wheels that fall on one coarse cell have no span to divide by.
+            # Wheels on one coarse cell would have a span of 0.
             np.maximum(spans, cell).astype(np.float32),
             weights.astype(np.float32),
             max(1, round(0.25 * vehicle.wheel_diameter / cell)),
@@ -95,7 +94,7 @@ class Stance(NamedTuple):
 
 
 def _parts(length: float, other: float) -> int:
-    """Into how many about square parts a side is divided; the shorter one into two."""
+    """Number of parts of a side, for about square parts; the shorter side has two."""
     return max(2, round(2.0 * length / min(length, other)))
 
 
@@ -106,13 +105,13 @@ def _rotation(angle: float) -> Floats:
 
 
 def stride(vehicle: Vehicle, cell: float) -> int:
-    """Cells from place to place."""
-    # At least seven places along a wheel's diameter.
+    """Cells from position to position."""
+    # At least seven positions along a wheel's diameter.
     return max(1, int(vehicle.wheel_diameter / (7 * cell) + 1e-6))
 
 
 def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: Bools) -> Places:
-    """Put the vehicle down everywhere.
+    """Place the vehicle everywhere.
 
     Parameters
     ----------
@@ -123,7 +122,7 @@ def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: B
     stance = Stance.of(vehicle, cell)
     reach = int(max(np.abs(stance.wheels).max(), np.abs(stance.belly).max()))
     out = Places(*(np.zeros(high.shape, dtype=np.float32) for _ in Places._fields))
-    # Beyond the map all is unknown; a wheel there may still touch ground of the map.
+    # Outside of the map all is unknown; wheels at its border may still touch ground of the map.
     high, low = (np.pad(a, reach, constant_values=np.nan) for a in (high, low))
     unknown = np.pad((~whole).astype(np.float32), reach, constant_values=1.0)
     stand, belly = (running_max(high, n) for n in (stance.wheel_reach, stance.belly_reach))
@@ -137,7 +136,7 @@ def place(high: Floats32, low: Floats32, vehicle: Vehicle, cell: float, whole: B
 
 class _Ground(NamedTuple):
     """Padded maps (row, col): highest and lowest ground below a wheel, highest below a part of the belly (m), and
-    whether any of either is unknown."""
+    whether any ground below a wheel, or below a part of the belly, is unknown."""
 
     stand: Floats32
     lowest: Floats32
@@ -148,8 +147,8 @@ class _Ground(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _place(ground, stance, out):  # type: ignore[no-untyped-def]
-    """Fill ``out``, tilt and slope squared, row by row: a row of a padded map, moved by an offset of ``stance``, lies
-    below one part of the vehicle at all places of the row."""
+    """Fill ``out``, tilt and slope squared, row by row: a row of a padded map, moved by an offset of ``stance``, is the
+    ground below one part of the vehicle at all positions of the row."""
     rows, cols = out.tilt.shape
     headings = stance.wheels.shape[0]
     parts = headings * (stance.wheels.shape[1] + stance.belly.shape[1])
@@ -171,7 +170,7 @@ def _place(ground, stance, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _below_wheels(a, wheels, r, cols):  # type: ignore[no-untyped-def]
-    """Lines of a map below the four wheels at the places of row ``r``."""
+    """Rows of a map below the four wheels at the positions of row ``r``."""
     return (
         a[r + wheels[0, 0], wheels[0, 1] : wheels[0, 1] + cols],
         a[r + wheels[1, 0], wheels[1, 1] : wheels[1, 1] + cols],
@@ -182,7 +181,7 @@ def _below_wheels(a, wheels, r, cols):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
-    """Raise ``out`` to the greatest squared gradient of the planes through three wheels, those that are known."""
+    """Raise ``out`` to the greatest squared gradient of the planes through three wheels on known ground."""
     one, zero = np.float32(1.0), np.float32(0.0)
     left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
     for c in range(out.shape[0]):
@@ -206,8 +205,7 @@ def _rise(wheels, belly, weights, out):  # type: ignore[no-untyped-def]
     for c in range(out.shape[0]):
         fl, fr = belly[c] - wheels[0][c], belly[c] - wheels[1][c]
         rl, rr = belly[c] - wheels[2][c], belly[c] - wheels[3][c]
-        # Each gap is cut off at 0 before it is weighed: a hollow under one wheel must not make up for a stone at
-        # another.
+        # Each difference is cut off at 0 before it is weighted, so that none compensates another.
         total = w0 * (fl if fl > zero else zero) + w1 * (fr if fr > zero else zero)
         total += w2 * (rl if rl > zero else zero) + w3 * (rr if rr > zero else zero)
         out[c] = total if total > out[c] else out[c]

@@ -1,22 +1,20 @@
-"""Risk map: where a vehicle must not go, measure by measure against its limits (section 4.6).
+"""Risk map: where a vehicle must not go, by measures against its limits (section 4.6).
 
 Classes, from the least to the greatest risk: *safe*; *caution*, where a measure comes near its limit, or exceeds it
-with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure exceeds its limit, or
-does with ``sigmas`` standard deviations added; and *unknown*, where too little of the window is known to say, which
-is never entered. The measures, their noise and the probability are those of :mod:`rille.stages.hazard.measures`; each
-that exceeds its limit has its bit in ``reason``.
+with a probability of more than ``max_p``, as beside unknown ground; *hazard*, where a measure, with ``sigmas`` standard
+deviations added, exceeds its limit; and *unknown*, where too little of the window is known, which is never entered. The
+measures, their noise and the probability are those of :mod:`rille.stages.hazard.measures`; each that exceeds its limit
+has its bit in ``reason``.
 
 Where five cells are at most a wheel's radius, a 3 x 3 median first removes single wrong cells; coarser models keep
 every cell, since one cell may then be the top of a stone, or a post.
 
-Guarantees, each tested: of two elevation models the one with the greater relief (see
-:mod:`rille.stages.hazard.measures`), or with the greater standard deviations, is in no cell the safer one; nor is it
-with a larger ``sigmas``.
+Guarantees, each tested: no cell gets safer with greater relief (see :mod:`rille.stages.hazard.measures`), with greater
+standard deviations, or with a larger ``sigmas``.
 
-Holes. A window is judged on what is known of it, so unknown does not grow; a hazard that is proven by a part is one.
-Small holes are closed with a flag. Their heights lie within the range of the rim (:mod:`rille.stages.numeric.holes`),
-anywhere in it as far as is known, so they add no relief of their own, and their standard deviation is that of such a
-height.
+Holes. A window is judged by its known part, so unknown ground does not grow; a hazard in that part is one. Small holes
+are closed and flagged. Their heights lie within the range of the rim (:mod:`rille.stages.numeric.holes`), so they add
+no relief, and their standard deviation is that of a height anywhere in that range.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": 
 """Values of ``risk``."""
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
-because of sigma; some of the ground that is looked at is unknown."""
+because of sigma; part of the ground in the window or below the vehicle is unknown."""
 
 
 def risk_map(
@@ -69,8 +67,8 @@ def risk_map(
 
     Parameters
     ----------
-    elevation, elevation_std : (row, col), metres, NaN unknown; what is infinite, or infinitely uncertain, is unknown
-        ground, and ground of unknown standard deviation counts as exact.
+    elevation, elevation_std : (row, col), metres, NaN unknown; infinite values mean unknown ground, and ground of
+        unknown standard deviation counts as exact.
     cell : side of a cell, metres.
     vehicle : limits.
     params : parameters; None for the defaults.
@@ -99,7 +97,7 @@ def risk_map(
 
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
-    """Refuse a vehicle that does not fit on the map at all."""
+    """Refuse a vehicle that does not fit on the map."""
     width, side = 2.0 * vehicle.half_width, min(shape) * cell
     if width > side:
         raise DegenerateError(
@@ -133,7 +131,7 @@ def risk_stage(params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = 
     lattices = [Lattice.from_dict(bundle.meta["lattice"]) for bundle in dem]
     whole = union(lattices)
     z = mosaic([(part, bundle["elevation"]) for part, bundle in zip(lattices, dem, strict=True)], np.nan, whole)
-    # Slopes and steps compare a cell with the ground around it, so the error that all of it shares does not count.
+    # Measures compare a cell with the ground around it, so the error that both share does not count.
     names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dem]
     stds = [(part, d[name]) for part, d, name in zip(lattices, dem, names, strict=True) if name is not None]
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)

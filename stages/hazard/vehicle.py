@@ -1,4 +1,4 @@
-"""The vehicle whose limits decide what is hazardous: metres and degrees, at the scale of the sequence."""
+"""The vehicle, whose limits decide which cells are hazardous: metres and degrees, at the scale of the sequence."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Vehicle(Params):
 
     @property
     def wheel_width(self) -> float:
-        """Metres; half the diameter, as that of most rovers is."""
+        """Metres; half the diameter, as for most rovers."""
         return 0.5 * self.wheel_diameter
 
     @property
@@ -70,4 +70,4 @@ class Vehicle(Params):
 
 
 DEFAULT_VEHICLE = Vehicle()
-"""Used, and named in the report, where neither the sequence nor the user states a vehicle."""
+"""Used, and named in the report, if neither the sequence nor the user states a vehicle."""

@@ -1,1 +1,1 @@
-"""Images before they are matched: pyramids, undistortion, quality."""
+"""Images before matching: pyramids, undistortion, quality."""

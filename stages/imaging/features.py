@@ -1,9 +1,9 @@
-"""SIFT features of an image, and which of two images match: for all that compares images without a start.
+"""SIFT features of an image, and matches between two images, for comparisons without a start.
 
 Keypoints and descriptors are OpenCV's (Lowe 2004, doi:10.1023/B:VISI.0000029664.99615.94); the square root of the
 descriptors' L1-normalised values as bytes is that of COLMAP (Arandjelovic and Zisserman 2012,
 doi:10.1109/CVPR.2012.6248018). OpenCV always begins with an image of twice the size: a large image is halved before, so
-that its first octave has the image's own resolution, which is a fifth of the work.
+that its first octave has the resolution of the image, which takes a fifth of the time.
 """
 
 from __future__ import annotations
@@ -61,12 +61,13 @@ def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
     if halving == 2:
         # Smoothed by the blur that SIFT assumes; area means would leave aliases, and errors a tenth larger.
         grey = cv2.pyrDown(grey)
-    # COLMAP's contrast of a keypoint, as OpenCV counts. OpenCV's own scale of the first octave, 1.6 px of a doubled
-    # image, finds fewer of the small features, which are the most exact: errors on the short mockup are a third larger.
+    # COLMAP's contrast of a keypoint in OpenCV's units. With OpenCV's default scale of the first octave, 1.6 px of a
+    # doubled image, fewer small features are found, which are the most exact: errors on the short mockup are a third
+    # larger.
     sift = cv2.SIFT.create(MAX_FEATURES, 3, 0.02, sigma=1.3, enable_precise_upscale=True)
     found, sizes, descriptors = root_sift(sift, grey)
     points = (halving * found + PIXEL_CENTRE) * factor
-    # Their size is the diameter, two scales.
+    # Sizes are diameters: two scales.
     keep = _away_from_mask(points, 0.5 * halving * factor[0] * sizes, valid)
     return Bundle({"points": points[keep].astype(np.float32), "descriptors": descriptors[keep]}, {})
 
@@ -74,7 +75,7 @@ def extract(image: NDArray[Any], valid: NDArray[Any]) -> Bundle:
 def root_sift(sift: cv2.SIFT, grey: Bytes, valid: Bytes | None = None) -> tuple[Floats, Floats, Bytes]:
     """Points (n, 2) column, row of an image (row, col), their sizes (n,), pixels, and descriptors (n, 128).
 
-    ``valid`` (row, col): points are where it is not 0; None: anywhere.
+    ``valid`` (row, col): not zero where points may lie; None: anywhere.
     """
     keypoints, values = sift.detectAndCompute(grey, valid)
     if not keypoints:
@@ -91,12 +92,12 @@ def _away_from_mask(points: Floats, scale: Floats, valid: NDArray[Any]) -> Bools
     distance = cv2.distanceTransform((valid != 0).astype(np.uint8), cv2.DIST_L2, 5)
     cols, rows = np.floor(points).astype(np.intp).T
     inside = distance[np.clip(rows, 0, valid.shape[0] - 1), np.clip(cols, 0, valid.shape[1] - 1)]
-    # Nearer ones may describe the edge of the mask.
+    # Descriptors of nearer ones may show the edge of the mask.
     return np.asarray(inside > 3.0 * scale)
 
 
 def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
-    """Indices (m, 2) of matching descriptors (n, 128), bytes: nearest in both directions, clearly before the second.
+    """Indices (m, 2) of matching descriptors (n, 128), bytes: nearest in both directions, clearly nearer than others.
 
     Products of bytes summed over 128 stay below 2**24 and are thus exact in float32, in any order of summation; a
     matrix product is some ten times faster than COLMAP's loops.
@@ -107,24 +108,24 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
     products = a @ b.T
     rows, nearest = np.arange(len(a)), products.argmax(axis=1)
     best = products[rows, nearest]
-    # One a column: the other of two that are equally near stays, and is the second best below.
+    # One for each column: the other of two equally near ones remains, and is the second best below.
     rows = np.flatnonzero(products.argmax(axis=0)[nearest] == rows)
     nearest, best = nearest[rows], best[rows]
-    # What is left of them is the second best of each row and column.
+    # The largest remaining product is the second best of each row and column.
     products[rows, nearest] = 0.0
     keep = _clear(best, products.max(axis=1)[rows]) & _clear(best, products.max(axis=0)[nearest])
     return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.uint32)
 
 
 def _clear(best: Floats32, second: Floats32) -> Bools:
-    """Whether the angles of products of descriptors are those of a match, before the second best."""
+    """Which products of descriptors are those of a match, clearly better than the second best."""
     near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (best, second))
     return np.asarray((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near))
 
 
 def matched_points(a: Bundle, b: Bundle) -> tuple[Floats, Floats]:
-    """Points (m, 2), (m, 2) column, row of features that match, of results of stage ``features``; the centre of the
-    first pixel is at (0, 0)."""
+    """Points (m, 2), (m, 2) column, row of matching features, from two results of stage ``features``; the centre of
+    the first pixel is at (0, 0)."""
     pairs = match(*(np.asarray(one["descriptors"], np.float32) for one in (a, b)))
     first, second = (np.asarray(s["points"], np.float64)[pairs[:, k]] - PIXEL_CENTRE for k, s in enumerate((a, b)))
     return first, second

@@ -24,18 +24,18 @@ MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 """Grey values at which an 8-bit image is taken as clipped."""
 
 MAX_GREY_ROWS = 0.1
-"""Share of the rows of an image that show one grey value, beyond those of the other camera's, that is no chance."""
+"""Share of the rows of an image with one grey value, beyond those of the other image, that is no chance."""
 
 STRIP_ROWS = 32
-"""Rows of a strip: some ten thousand pixels, and thrice what the wider blur reaches."""
+"""Rows of a strip: some ten thousand pixels, and three times the reach of the wider blur."""
 
 
 def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
-    """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: nothing is.
+    """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: no pixel is usable.
 
-    Sharpness is the share of detail between one and two pixels in that between two and four, RMS: it hardly depends on
-    what is shown, but falls with blur. Detail is the latter over the deviation: where even that is gone, noise alone
-    decides on the sharpness.
+    Sharpness is the detail between one and two pixels over that between two and four, RMS: it hardly depends on the
+    scene, but decreases with blur. Detail is the latter over the standard deviation: without it noise alone determines
+    the sharpness.
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
@@ -44,7 +44,7 @@ def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
         if not usable.any():
             return math.nan, 0.0
         level = np.where(usable, level, level[usable].mean())
-        # Three standard deviations of the wider blur: farther from the mask, what is compared is the image's own.
+        # Three standard deviations of the wider blur, within which the mask changes the result.
         inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
     once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
     count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
@@ -56,18 +56,18 @@ def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
-    ``mean`` (None: nothing is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped pixels;
-    ``sharpness`` (None: none to tell) and ``detail`` of strips; ``digest`` of the pixels; where they are many, share
+    ``mean`` (None: no pixel is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped
+    pixels; ``sharpness`` (None: unknown) and ``detail`` of strips; ``digest`` of the pixels; if large, share
     ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
-    # (0.25, 0.5, 0.75): of the height: where the strips lie whose sharpness stands for the image's.
+    # (0.25, 0.5, 0.75): positions over the height of strips, which represent the image.
     first = sorted(
         {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in (0.25, 0.5, 0.75)}
     )
     textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
     sharp = [s for s, _ in textures if math.isfinite(s)]
-    # A quarter of the pixels tells mean and deviation well enough.
+    # A quarter of the pixels is enough for mean and deviation.
     thinned = grey(np.ascontiguousarray(image[::2, ::2]))
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
     (mean,), (deviation,) = (a.ravel() for a in cv2.meanStdDev(thinned, mask=mask))
@@ -88,7 +88,7 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
 
 
 def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """Say of which camera images have rows of one grey value that the other's of the same frames have not.
+    """Warnings about cameras whose images have rows of one grey value that the other's of the same frames do not have.
 
     ``sides``: figures of :func:`glance` of the left and of the right images. A sky of one value is in both.
     """

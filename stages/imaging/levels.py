@@ -1,4 +1,4 @@
-"""Spread the grey values of 16-bit images that use a small part of their range, by one rule for a whole sequence."""
+"""Spread the grey values of 16-bit images that use a small part of their range, equally for a whole sequence."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ WHITE = 65535
 
 
 OUTLYING = (0.5, 99.5)
-"""Percentiles of an image's samples beyond which they do not count."""
+"""Percentiles of an image's samples between which they count."""
 
 
 def levels_of(images: Iterable[AnyArray]) -> Levels | None:
-    """Levels for all images of a sequence by some of them; None where they use their range, or show nothing but noise.
+    """Levels for all images of a sequence by some of them; None if they use their range, or show nothing but noise.
 
-    The gain is a power of two that leaves the samples of these images half of the range, for others may be brighter.
+    The gain is the power of two that spreads the samples of these images to about half of the range, since others may
+    be brighter.
     """
     deep = _deep(images)
     if not deep:
@@ -36,14 +37,16 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     if span > 1 / 8 * WHITE and top > 1 / 4 * WHITE:
         return None
     gain = 1 << (WHITE // (2 * span)).bit_length() - 1
-    # Their middle becomes that of the range, but black stays black.
+    # Their middle becomes that of the range; black is never raised.
     return (max((dark + bright) // 2 - WHITE // (2 * gain), 0), gain) if gain > 1 else None
 
 
 def levels_of_sides(left: Iterable[AnyArray], right: Iterable[AnyArray]) -> tuple[Levels | None, Levels | None]:
-    """Levels of the left and of the right images: the same, unless one camera fills more of its 16 bits by two or more.
+    """Levels of the left and of the right images: the same, unless one camera uses at least two bits more than the
+    other one.
 
-    One driver leaves 12 bits as they are, and another one shifts them: by one rule one side would keep 16 grey values.
+    One driver leaves 12 bits as they are, another one shifts them: with common levels one side would keep 16 grey
+    values.
     """
     sides = _deep(left), _deep(right)
     tops = [max((float(np.percentile(image, OUTLYING[1])) for image in side), default=0.0) for side in sides]
@@ -54,7 +57,7 @@ def levels_of_sides(left: Iterable[AnyArray], right: Iterable[AnyArray]) -> tupl
 
 
 def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
-    """A uint16 image with its samples spread; any other one as it is."""
+    """A uint16 image with its samples spread; any other image unchanged."""
     if levels is None or not np.issubdtype(image.dtype, np.uint16):
         return image
     black, gain = levels
@@ -62,7 +65,7 @@ def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
 
 
 def words(sides: tuple[Levels | None, Levels | None]) -> list[str]:
-    """What is done to the left and to the right images, a line each, or one for both."""
+    """Changes of the left and of the right images, in words, one line each, or one for both."""
     named = {"all": sides[0]} if sides[0] == sides[1] else dict(zip(("left", "right"), sides, strict=True))
     spread_ones = [(name, *levels) for name, levels in named.items() if levels is not None]
     text = "16-bit samples use a small part of their range: (sample - {}) x {} is taken of {} images"
@@ -70,11 +73,11 @@ def words(sides: tuple[Levels | None, Levels | None]) -> list[str]:
 
 
 def swapped(image: AnyArray) -> bool:
-    """Whether a grey image (row, col) of 16 bits is noise, and an image with the bytes of its samples exchanged."""
+    """Whether a grey image (row, col) of 16 bits looks like noise, but not with the bytes of its samples exchanged."""
     if image.dtype != np.uint16 or image.shape[1] < 2 or not image.std():
         return False
     rough = [float(np.abs(np.diff(a, axis=1)).mean() / a.std()) for a in map(np.float64, (image, image.byteswap()))]
-    # Mean difference of neighbouring samples in their standard deviations: of noise 1.1, of images 0.1 to 0.3.
+    # Mean difference of neighbouring samples over their standard deviation: noise has 1.1, images have 0.1 to 0.3.
     return rough[0] > 0.5 > 2 * rough[1]
 
 
@@ -83,7 +86,7 @@ def _deep(images: Iterable[AnyArray]) -> list[AnyArray]:
 
 
 def _shows(image: AnyArray) -> bool:
-    # Of a thermal camera a few dead pixels deviate by more than all of the scene.
+    # A few dead pixels of a thermal camera deviate more than the whole scene.
     image = np.clip(image, *np.percentile(image, OUTLYING)).astype(np.float32)
-    # Means of 4 x 4 pixels keep a quarter of the deviation of noise alone.
+    # Means of 4 x 4 pixels reduce the standard deviation of noise to a quarter.
     return bool(cv2.blur(image, (4, 4)).std() > 0.5 * image.std())

@@ -2,8 +2,8 @@
 
 Pixel centres are at integers, so column ``x`` of level 0 lies at ``x_n = (x + 0.5) / 2**n - 0.5`` on level n. Odd sizes
 are completed by repeating the last row or column. A coarse pixel is valid if at least three of its four pixels are
-(:data:`MIN_VALID`); its value is the mean of the valid ones. A black frame, as warping an image leaves, is no part of
-it (:func:`frame`); there two of four are enough.
+(:data:`MIN_VALID`); its value is the mean of the valid ones. A black frame, as left by warping, is masked
+(:func:`frame`); then two of four are enough.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class PyramidParams(Params):
 
 
 MIN_VALID = 3
-"""Valid pixels of four that make a coarse pixel valid. A frame one pixel wide doubles its width so, in pixels of the
-image, from level to level."""
+"""Fewest valid pixels of four that make a coarse pixel valid. So a frame one pixel wide at least doubles its width, in
+pixels of the image, from level to level."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Pyramid:
         return Pyramid(images, valid, float(bundle.meta.get("noise", 0.0)))
 
     def above(self, level: int) -> Pyramid:
-        """The pyramid from a level on; noise halves from level to level."""
+        """The pyramid from a level up; noise halves from level to level."""
         return Pyramid(self.images[level:], self.valid[level:], self.noise * 0.5**level)
 
 
@@ -95,7 +95,7 @@ class _Read(Sequence[AnyArray]):
 
 
 def grey(image: AnyArray) -> Floats32:
-    """Image (row, col) as float32 grey 0..255: uint8 as it is, uint16 over 257, floating point taken as 0..255.
+    """Image (row, col) as float32 grey 0..255: uint8 unchanged, uint16 over 257, floating point as 0..255.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def grey(image: AnyArray) -> Floats32:
     """
     if image.ndim != 2 or image.size == 0:
         raise InputError("RIL-411", f"image of shape {image.shape} is not (row, col)", remedy="give one grey channel")
-    if np.issubdtype(image.dtype, np.uint16):  # of either byte order, as archives keep the big end first
+    if np.issubdtype(image.dtype, np.uint16):  # of either byte order: archives have the big end first
         return image.astype(np.float32) * np.float32(1.0 / 257.0)
     if image.dtype == np.uint8 or image.dtype.kind == "f":
         return np.ascontiguousarray(image, dtype=np.float32)
@@ -131,7 +131,7 @@ def usable(image: Floats32, valid: AnyArray | None) -> Bools:
 
 
 def levels_of(shape: tuple[int, ...], params: PyramidParams) -> int:
-    """Levels of the pyramid of an image of a shape."""
+    """Number of levels of the pyramid of an image of this shape."""
     levels, side = 1, min(shape)
     while levels < params.levels and side >= 2 * params.min_side:
         levels, side = levels + 1, (side + 1) // 2
@@ -153,13 +153,13 @@ def build(image: AnyArray, params: PyramidParams, valid: AnyArray | None = None)
     """
     level = grey(image)
     mask = usable(level, valid)
-    # What a mask leaves out is often black, too, and no frame.
+    # Masked pixels, often black too, do not count as a frame.
     black = frame(level, mask)
     if black is not None:
         mask &= ~black
     if not (image.dtype.kind == "u" and valid is None and black is None):
         level = np.where(mask, level, np.float32(0.0))
-    # 2: where the image has a black frame: pixels that are half outside of a warped image draw matches astray.
+    # 2: with a black frame, because pixels half outside of a warped image mislead matches.
     least = MIN_VALID if black is None else 2
     pyramid = halved(level, mask.view(np.uint8), levels_of(level.shape, params), least)
     return Pyramid(pyramid.images, pyramid.valid, noise.standard_deviation(pyramid.images, pyramid.valid))
@@ -169,8 +169,8 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
     """Black frame (row, col) that warping left around the valid pixels of an image; None: there is none.
 
     It consists of connected pixels of grey 0 that cover a good part of a side and stay near it; darkness that reaches
-    into the image is a shadow or the sky. Where interpolation has mixed the pixels beside the frame with black, they
-    belong to it, and so do the outermost pixels of the sides that it touches.
+    into the image is a shadow or the sky. Pixels beside the frame that interpolation has mixed with black belong to it,
+    and then also the outermost pixels of the sides that it touches.
     """
     dark = (image == 0) & valid
     sides: tuple[Any, ...] = (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1])
@@ -198,7 +198,7 @@ def frame(image: Floats32, valid: Bools) -> Bools | None:
 
 
 def halved(image: Floats32, mask: Mask, levels: int, least: int = MIN_VALID) -> Pyramid:
-    """Pyramid of so many levels of a float32 image (0 where masked) and its mask; ``least`` of four make one valid."""
+    """Pyramid (``levels``) of a float32 image (0 where masked) and its mask; ``least`` of four make one valid."""
     images, masks = [image], [mask]
     for _ in range(levels - 1):
         odd = [n % 2 for n in image.shape]
@@ -218,7 +218,7 @@ def halved(image: Floats32, mask: Mask, levels: int, least: int = MIN_VALID) -> 
 
 
 def filled_from(above: Floats32, image: Floats32, mask: Bools, y: int = 0, x: int = 0) -> Floats32:
-    """Image (row, col) whose masked pixels (``mask`` false) carry the grey of the level above.
+    """Image (row, col) whose masked pixels (``mask`` false) have the grey of the level above.
 
     ``y, x``: row and column of the image's first pixel, where pixel (0, 0) lies under the first one of ``above``.
     """

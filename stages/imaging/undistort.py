@@ -1,8 +1,8 @@
-"""One image as an ideal camera would have taken it: lens distortion removed, and nothing else (no rectification).
+"""One image with its lens distortion removed, as an ideal camera would have taken it, without rectification.
 
-Each ideal pixel is read from the raw image where the lens model says that it lies. OpenCV's ``remap`` would do it, but
-its weights are rounded to 1/32 pixel and its cubic kernel (a = -0.75) displaces texture by up to 0.046 px, as much as
-the matcher resolves. Here the weights are exact to 1/8192 pixel, and a pixel is valid only if all that entered it is.
+Each ideal pixel is read from the raw image at its position by the lens model. OpenCV's ``remap`` rounds weights to 1/32
+pixel, and its cubic kernel (a = -0.75) displaces texture by up to 0.046 px, as much as the matcher resolves. Here the
+weights are exact to 1/8192 pixel, and a pixel is valid only if all pixels that it is computed from are.
 
 Source of the cubic kernel: Keys (1981), Cubic convolution interpolation for digital image processing,
 doi:10.1109/TASSP.1981.1163711, the six-point kernel of fourth order.
@@ -21,7 +21,7 @@ from rille.stages.geometry.lens import Lens
 from rille.stages.imaging.pyramid import grey, usable
 
 PHASES_PER_PX = 4096
-"""Positions between two pixels that weights are tabulated for; the nearest one is taken."""
+"""Positions between two pixels with tabulated weights; the nearest one is used."""
 
 KERNEL_REACH_PX = 3
 """Pixels that the kernel reaches to each side. Six taps displace texture of a period of 6 pixels by at most 0.004
@@ -37,20 +37,20 @@ def _cubic(d: Floats) -> Floats:
 
 
 def weights() -> Floats32:
-    """Weights (phase, tap): phase i is i / ``PHASES_PER_PX`` past the tap in the middle's left half; rows sum to 1."""
+    """Weights (phase, tap): phase i is i / ``PHASES_PER_PX`` past the left one of the middle taps; rows sum to 1."""
     phase = np.arange(PHASES_PER_PX + 1) / PHASES_PER_PX
     table = _cubic(np.abs(phase[:, None] - np.arange(1 - KERNEL_REACH_PX, KERNEL_REACH_PX + 1)))
     return np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
 
 
 def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | None = None) -> tuple[Floats32, Bytes]:
-    """The image that ``camera`` would have taken from the same place.
+    """The image of ``camera`` at the same place, and its mask.
 
     Parameters
     ----------
     image : (row, col) uint8, uint16 (divided by 257) or floating point 0..255, of the size of ``lens.camera``.
     lens : the camera that took it.
-    camera : the ideal camera wanted, with the same viewing direction; any size.
+    camera : the ideal camera, with the same viewing direction; any size.
     valid : (row, col) of the raw image, not zero where usable; None: everywhere.
 
     Returns
@@ -81,16 +81,16 @@ def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | Non
 
 @njit(cache=True, nogil=True)
 def _resample(image, usable, maps, table, out, out_valid):  # type: ignore[no-untyped-def]
-    """Separable weighted mean of the raw pixels about (column, row) of the maps, where all of them are usable."""
+    """Separable weighted mean of the raw pixels around (column, row) of the maps, where all of them are usable."""
     column, row = maps
-    # Most images have no mask: then no pixel's neighbourhood need be looked up.
+    # Most images have no mask: then neighbourhoods need no check.
     taps, whole = table.shape[1], usable.all()
     before = taps // 2 - 1
     rows, cols = image.shape
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             x, y = column[i, j], row[i, j]
-            # also refuses NaN; a position on the last pixel needs no tap beyond it, but gets no branch of its own
+            # Also excludes NaN, and a position on the last pixel, which needs no tap beyond it.
             if not (x >= before and x < cols - before - 1 and y >= before and y < rows - before - 1):
                 continue
             left, top = int(x), int(y)

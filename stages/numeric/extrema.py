@@ -1,4 +1,4 @@
-"""Running maxima, ranges and medians in windows: statistics by the order of the heights, not by their mean.
+"""Running maxima, ranges and medians in windows: order statistics of the heights.
 
 The window is an octagon rather than a square. Over a square the highest minus the lowest height of a plane is larger by
 a factor of 1.41 if the plane falls along the diagonal. Over a regular octagon this factor is at most 1.08 (for small
@@ -17,7 +17,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats32
 
 UNKNOWN_HEIGHT = np.float32(-np.inf)
-"""Stands where no cell is known: every height is above it."""
+"""Value of unknown cells: every height is above it."""
 
 
 def octagon(reach: int) -> tuple[int, int]:
@@ -47,10 +47,10 @@ def running_max(surface: Floats32, reach: int) -> Floats32:
 def relief(surface: Floats32, near: int, reach: int) -> tuple[Floats32, Floats32]:
     """Highest minus lowest value (row, col) within two octagons, ``near`` and ``reach`` >= near.
 
-    It is 0 where all is unknown.
+    It is 0 where all cells are unknown.
     """
     high, depth = ([running_max(z, n) for n in (near, reach)] for z in (surface, -surface))
-    # Highest minus lowest, which is the highest plus the greatest depth.
+    # Highest minus lowest: the highest plus the greatest depth.
     small, large = (np.maximum(a + b, np.float32(0.0)) for a, b in zip(high, depth, strict=True))
     return small, large
 
@@ -58,7 +58,7 @@ def relief(surface: Floats32, near: int, reach: int) -> tuple[Floats32, Floats32
 def median3(surface: Floats32) -> Floats32:
     """Median (row, col) of the known cells in 3 x 3; unknown stays unknown.
 
-    Of an even number the upper one: the mean of two heights would not be one of the heights.
+    Of an even number the upper one, so that the median is one of the heights.
     """
     padded = np.pad(surface, 1, constant_values=np.nan)
     out = np.ascontiguousarray(cv2.medianBlur(padded, 3)[1:-1, 1:-1])  # right where all nine are known

@@ -1,4 +1,4 @@
-"""Small holes of an elevation model: closed by interpolation between their rims, never across more than stated."""
+"""Close small holes of an elevation model by interpolation between their rims, up to a largest gap."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rille.stages.core.arrays import Bytes, Floats32
 from rille.stages.numeric.windows import window_count
 
 RIM_STD_SHARE = 1.0 / math.sqrt(12.0)
-"""Standard deviation of a height that lies anywhere within a range, of that range."""
+"""Standard deviation of a height that lies anywhere within a range, over that range."""
 RAY_STEPS = np.array([[0, 1], [1, 0], [1, 1], [1, -1]])
 """Rows and columns from a cell to the next one of its row, its column and its two diagonals."""
 
@@ -22,10 +22,10 @@ def close_holes(
 ) -> tuple[Floats32, Floats32, Bytes]:
     """Interpolate unknown cells that lie between known ones.
 
-    A cell is closed when known cells face each other across it, along a row, a column or a diagonal, with at most
-    ``max_gap`` of unknown ground between them, and at least ``min_known`` of the window around it is known. Along
-    each such line the height is interpolated linearly (a plane is restored exactly); lines weigh by the inverse
-    distances to their ends. The result is never outside the range of the rim cells used.
+    A cell is closed if known cells face each other across it, along a row, a column or a diagonal, with at most
+    ``max_gap`` of unknown ground between them, and if at least ``min_known`` of the window around it is known. Along
+    each such line the height is interpolated linearly (a plane is restored exactly); lines are weighted by the inverse
+    distances to their ends. The result lies within the range of the rim cells.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def close_holes(
 
 
 def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int64]:
-    """Unknown cells, counted row by row, of whose n x n window at least ``min_known`` is known."""
+    """Unknown cells, as flat indices, with at least ``min_known`` of their n x n window known."""
     unknown = np.isnan(elevation)
     if not unknown.any():
         return np.empty(0, dtype=np.int64)
@@ -79,13 +79,13 @@ def _close(z, cells, max_gap, out, std, filled):  # type: ignore[no-untyped-def]
             low, high = min(low, z[p], z[q]), max(high, z[p], z[q])
         if weight > 0.0:
             out[r, c], filled[r, c] = total / weight, 1
-            # No cell that is interpolated is more certain than the least certain that it comes from.
+            # An interpolated cell is not more certain than the least certain one that it comes from.
             std[r, c] = max(worst, RIM_STD_SHARE * (high - low))
 
 
 @njit(cache=True, nogil=True)
 def _to_known(z, cell, step, reach):  # type: ignore[no-untyped-def]
-    """Number of steps from a cell to the next known one, ``reach`` at most; 0: there is none."""
+    """Number of steps from a cell to the next known one, at most ``reach``; 0: there is none."""
     rows, cols = z.shape
     for k in range(1, reach + 1):
         r, c = cell[0] + k * step[0], cell[1] + k * step[1]

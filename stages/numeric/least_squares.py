@@ -1,4 +1,4 @@
-"""Least squares: Levenberg-Marquardt for problems that are not linear, reweighting for those that have outliers.
+"""Least squares: Levenberg-Marquardt for nonlinear problems, iterative reweighting for outliers.
 
 Sources: Marquardt (1963), doi:10.1137/0111030; Holland and Welsch (1977), doi:10.1080/03610927708827533.
 """
@@ -14,11 +14,11 @@ from rille.stages.core.arrays import Floats
 
 
 class Equations(Protocol):
-    """Normal equations at a state, and the cost there: infinite of a state that cannot be."""
+    """Normal equations at a state, and its cost: infinite for an impossible state."""
 
     @property
     def cost(self) -> float:
-        """Half the weighted sum of squares, or what stands in its place."""
+        """Half the weighted sum of squares, or of the robust loss."""
         ...
 
 
@@ -35,7 +35,7 @@ N = TypeVar("N", bound=Equations)
 
 
 class Problem(Protocol[X, N]):
-    """Normal equations at a state, and the state a damped step on."""
+    """Normal equations at a state, and the state after a damped step."""
 
     def normal(self, state: X) -> N:
         """Normal equations at a state, with its cost."""
@@ -47,7 +47,7 @@ class Problem(Protocol[X, N]):
 
 
 class Minimum(NamedTuple, Generic[X]):
-    """Where an adjustment ended, its cost at the start and there, and the number of accepted steps."""
+    """Final state of an adjustment, its cost at the start and at the end, and the number of accepted steps."""
 
     state: X
     before: float
@@ -56,15 +56,16 @@ class Minimum(NamedTuple, Generic[X]):
 
 
 def levenberg_marquardt(problem: Problem[X, N], state: X, iterations: int, tolerance: float = 1e-9) -> Minimum[X]:
-    """Minimum from ``state``; never worse than the start. Ends where a step lowers the cost by ``tolerance`` of it."""
+    """Minimum from ``state``, never worse than the start; ends if a step changes the cost by at most ``tolerance``, as
+    a share of it."""
     damping, steps, finished = 1e-4, 0, False
     now = problem.normal(state)
     first = now.cost
-    # With more damping no step is expected to lower the cost any more.
+    # 1e8: with more damping no step is expected to lower the cost.
     while steps < iterations and not finished and damping <= 1e8:
         ahead = problem.ahead(state, now, damping)
         then = problem.normal(ahead)
-        # Also of a refused step: at the minimum it changes the cost by rounding alone.
+        # Refused steps count too: at the minimum they change the cost by rounding alone.
         finished = abs(now.cost - then.cost) <= tolerance * now.cost
         if then.cost < now.cost:
             state, now, damping, steps = ahead, then, max(0.1 * damping, 1e-12), steps + 1
@@ -83,21 +84,21 @@ def irls(
 ) -> Floats:
     """Unknowns x of ``design @ x = target`` by reweighted least squares, as ``target`` (..., k, m) or (k,).
 
-    They minimise ``sum w |design x - target|^2 + (x - start)' prior (x - start)``, the weights w being those of the
-    residuals that the round before left.
+    They minimise ``sum w |design x - target|^2 + (x - start)' prior (x - start)``, with weights w by the residuals of
+    the round before.
 
     Parameters
     ----------
-    design, target : (..., n, k) and (..., n, m), leading axes being problems of their own; or (n, k) and (n,).
+    design, target : (..., n, k) and (..., n, m), with separate problems along the leading axes; or (n, k) and (n,).
     weigh : weights (..., n) of the lengths (..., n) of the rows' residuals.
-    prior : (k, k), information that is held besides; without any the weighted rows must determine the unknowns.
-    start : what the first weights are of, and what the prior holds; None: weights of residuals of 0, and zeros.
-    rounds : at most; fewer where the unknowns have settled.
+    prior : (k, k), information matrix; without it the weighted rows must determine the unknowns.
+    start : value of the prior, whose residuals give the first weights; None: zeros, and weights of residuals of 0.
+    rounds : at most; fewer if the unknowns have converged.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        The rows that have weight do not determine the unknowns.
+        The weighted rows do not determine the unknowns.
     """
     several = target.ndim == design.ndim
     y = target if several else target[..., None]
@@ -109,7 +110,7 @@ def irls(
     for _ in range(rounds):
         weighted = np.swapaxes(design * weigh(np.sqrt((rest**2).sum(-1)))[..., None], -1, -2)
         last, x = x, np.linalg.solve(weighted @ design + held, weighted @ y + held @ first)
-        # Of a height of metres, nanometres.
+        # 1e-9: nanometres for a height of metres.
         if np.abs(x - last).max() <= 1e-9 * np.abs(x).max():
             break
         rest = y - design @ x

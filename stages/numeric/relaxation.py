@@ -1,10 +1,10 @@
-"""Successive over-relaxation of a field that is smooth but for its bends, such as a surface.
+"""Successive over-relaxation of a field that is smooth except at bends, such as a surface.
 
 The field f (rows, cols) minimises, with the second differences f_xx along rows and f_yy along columns,
 
     sum (power (f - f_0)^2 - 2 pull (f - f_0))  +  sum across f_xx^2  +  sum down f_yy^2
 
-where ``power`` and ``pull`` are what the data say of each cell about its start f_0, and ``across`` and ``down`` the
+where ``power`` and ``pull`` are the data's terms about the start f_0 of each cell, and ``across`` and ``down`` the
 weights of the bends (:func:`bend_weights`), 0 where a neighbour is unknown.
 
 A sweep takes the cells in the order of reading.
@@ -20,13 +20,13 @@ from rille.stages.core.arrays import Bools, Floats32
 OVERRELAXATION = 1.7
 """Factor on each step, which stays convergent below 2."""
 BORDER = 2
-"""Cells of nothing around: a second difference reaches two cells far."""
+"""Empty cells around the field: a second difference reaches two cells."""
 
 
 def bend_weights(field: Floats32, scale: Floats32, bend: float, strength: float) -> tuple[Floats32, Floats32]:
     """Weights ``across``, ``down`` (rows, cols) of the second differences at each cell, float32.
 
-    They are ``strength scale^2 / (1 + (scale second difference / bend)^2)``: strong on smooth parts, weak at edges, 0
+    They are ``strength scale^2 / (1 + (scale second difference / bend)^2)``: large on smooth parts, small at edges, 0
     where a neighbour is NaN.
 
     Parameters
@@ -51,9 +51,9 @@ def relax(
     Parameters
     ----------
     start : (rows, cols) float32 to start from, NaN unknown.
-    power, pull : (rows, cols) float32; 0 where the data say nothing.
-    bends : ``across`` and ``down`` as :func:`bend_weights` gives them.
-    keep : (rows, cols) known cells that move; the others are returned as they are.
+    power, pull : (rows, cols) float32; 0 without data.
+    bends : ``across`` and ``down`` of :func:`bend_weights`.
+    keep : (rows, cols) known cells that move; the others are returned unchanged.
     """
     if not keep.any():
         return start
@@ -61,7 +61,7 @@ def relax(
     middle = np.nanmean(start)
     inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
     field, across, down = (np.pad(a, BORDER) for a in (np.nan_to_num(start - middle), *bends))
-    # Of the bend about the cell, and of those that end there.
+    # Weights of the bend at the cell, and of those that end there.
     weight = power + 4 * (across + down)[inner] + across[inner[0], 1:-3] + across[inner[0], 3:-1]
     weight += down[1:-3, inner[1]] + down[3:-1, inner[1]]
     inverse = np.divide(1, weight, out=np.zeros_like(weight), where=keep & (weight > 0))
@@ -84,8 +84,8 @@ def _sweep(field, across, down, goal, inverse, sweeps):  # type: ignore[no-untyp
                 if not inverse[r, c] > 0.0:
                     continue
                 j = c + BORDER
-                # What the second differences along the row, then the column want the cell to be, times their weights:
-                # as their second end, their first end and their middle.
+                # Values of the cell by which the second differences along the row, then the column, vanish, times their
+                # weights: the cell is their second end, their first end and their middle.
                 total = across[i, j - 1] * (two * row[j - 1] - row[j - 2])
                 total += across[i, j + 1] * (two * row[j + 1] - row[j + 2])
                 total += two * across[i, j] * (row[j - 1] + row[j + 1])

@@ -1,6 +1,6 @@
 """Sums and means over moving windows of a raster.
 
-Windows are square, centred and of odd side ``n``; outside of the raster there is nothing.
+Windows are square, centred and of odd side ``n``; cells outside of the raster do not count.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 
 
 def window_sum(a: NDArray, n: int) -> Floats:
-    """Sum (row, col), float64, over the window; whole numbers add up exactly."""
+    """Sum (row, col), float64, over the window; exact for integers."""
     total: Floats = _box(np.ascontiguousarray(a, dtype=np.float64), -1, n)
     return total
 
 
 def window_sum32(a: NDArray, n: int) -> Floats32:
-    """As :func:`window_sum`, added up in float64 too, but float32 before and after: half of the memory."""
+    """As :func:`window_sum`, but float32 before and after the sum, which takes half of the memory."""
     total: Floats32 = _box(np.ascontiguousarray(a, dtype=np.float32), -1, n)
     return total
 
 
 def window_count(mask: Bools, n: int) -> NDArray[np.int32]:
-    """Number (row, col) of cells in the window that are set."""
+    """Number (row, col) of set cells in the window."""
     total: NDArray[np.int32] = _box(mask.view(np.uint8), cv2.CV_32S, n)
     return total
 
 
 def window_room(shape: tuple[int, int], n: int) -> NDArray[np.int32]:
-    """Number (row, col) of cells in the window that the raster has."""
+    """Number (row, col) of cells of the raster in the window."""
     middle = [np.arange(size, dtype=np.int32) for size in shape]
     rows, cols = (np.minimum(a, n // 2) + np.minimum(a[::-1], n // 2) + 1 for a in middle)
     room: NDArray[np.int32] = np.multiply.outer(rows, cols)
@@ -47,7 +47,7 @@ def _box(values: NDArray, depth: int, n: int) -> Any:
 def window_mean(a: Floats32, n: int) -> Floats32:
     """Mean (row, col) of the known cells in the window; NaN where there is none."""
     known = ~np.isnan(a)
-    # Subtracted before summing: smaller sums have smaller rounding errors.
+    # Subtracted before summing, for smaller rounding errors.
     middle = a[known].mean(dtype=np.float64) if known.any() else 0.0
     total, count = window_sum(np.where(known, a - middle, 0.0), n), window_sum(known, n)
     mean = np.full(a.shape, np.nan, dtype=np.float32)

@@ -1,1 +1,1 @@
-"""Commands that compute a run, or say what it would compute."""
+"""Commands that compute a run, or its plan."""

@@ -1,7 +1,7 @@
-"""``rille compile``: the kernels of every stage, compiled before the first run asks for them.
+"""``rille compile``: compile the kernels of every stage before the first run.
 
-Numba compiles a kernel for the types that it is called with, so the kernels are called: by a small reconstruction and a
-small drive of simulated sequences, in a temporary folder. What they compile stays in the folder of this user's kernels.
+Numba compiles a kernel for the types of a call, so a small reconstruction and a small drive of simulated sequences call
+them, in a temporary folder. Compiled kernels stay in the folder of this user's kernels.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SMALL = (
     "mockup.bed_length=0.8",
     "locus.cell_size=0.005",
 )
-"""A reconstruction of five small pairs; it calls every kernel but one of what `mockup-short` calls."""
+"""A reconstruction of five small pairs, which calls all kernels of `mockup-short` except one."""
 
 
 def compile_kernels() -> int:
@@ -38,7 +38,7 @@ def compile_kernels() -> int:
     with tempfile.TemporaryDirectory() as folder:
         options = Options(SMALL, runs=Path(folder) / "runs", cache=f"{folder}/cache", quiet=True)
         perform("mockup-short", options, warn=lambda _: None)
-        # A drive that ends, far from its goal, when all kernels of driving were called
+        # A drive that ends early, when it has called all kernels of driving.
         driven = replace(options, assignments=("drive.max_stops=3",))
         perform("mockup-loop", driven, verb="drive", warn=lambda _: None)
     made, seconds = len(_kernels() - before), time.perf_counter() - began

@@ -1,10 +1,10 @@
-"""``rille plan``: what a run would compute, what it would take from the cache, and why; ``rille graph``: its stages.
+"""``rille plan``: tasks that a run would compute or take from the cache, and why; ``rille graph``: its stages.
 
-No work is done.
+Nothing is computed.
 
-What follows from results that are still to come (which pairs are basic, how far the world reaches) is laid out by the
-same results of the last run. A task behind one that is to be computed counts as to be computed; where its input turns
-out as before, to the bit, the run will find it in the cache all the same. The plan is thus an upper bound.
+Tasks that depend on results still to come (choice of basic pairs, extent of the world) are laid out by these results of
+the last run. A task that depends on one to be computed counts as to be computed, although the run will find it in the
+cache if its input is the same as before, to the bit. The plan is thus an upper bound.
 """
 
 from __future__ import annotations
@@ -52,32 +52,32 @@ def plan(
     def outputs() -> None:
         from rille.pipeline.runs import run_files  # it imports matplotlib
 
-        if graph.unfinished:  # not all of their inputs are known: they count among the tasks that follow
+        if graph.unfinished:  # some inputs are unknown, so they belong to the unknown tasks
             return
         run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))
     result.check()
-    # A parameter may be read by tasks that are not known yet.
+    # Unknown tasks may read a parameter.
     if not result.unknown and (lost := unread.unread(settled.given, config, graph)):
         raise unread.error(lost, config)
     budget = memory.budget(options.executor, memory_limit(options), options.jobs)
     planned = memory.Estimates().planned(graph)
     workers = budget.workers(max((needs for _, needs in planned), default=0.0))
-    # The refusal comes last, so that the table stands above it and shows which task it is.
+    # The refusal comes last, after the table with its task.
     for line in chain(describe(graph, result, workers, verbose=verbose), needs(planned, budget)):
         print(line)
     return COMPLETE
 
 
 def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterable[str]:
-    """A line on the memory [bytes] of what is to be computed; nothing where nothing is.
+    """A line on the memory [bytes] of the tasks to be computed, if there are any.
 
     Raises
     ------
     ConfigError
-        A task does not fit even alone.
+        A task does not fit into memory, even alone.
     """
     if planned:
         handle, largest = max(planned, key=lambda task: task[1])
@@ -88,7 +88,7 @@ def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterabl
 
 
 def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = False) -> Iterable[str]:
-    """Lines of the plan: a table by stage with reasons, totals, and what it rests on."""
+    """Lines of the plan: a table by stage with reasons, totals, and assumptions."""
     by_stage: dict[str, list[Handle]] = defaultdict(list)
     for handle in graph.nodes:
         by_stage[handle.stage].append(handle)
@@ -103,7 +103,7 @@ def describe(graph: Graph, result: Result, workers: int, *, verbose: bool = Fals
 
 
 def _reasons(planned: list[Handle]) -> list[str]:
-    """The reasons of a stage's tasks, own ones first, the most frequent first, with their number."""
+    """The reasons of a stage's tasks with their numbers, own ones first, the most frequent first."""
     own = Counter(h.reason for h in planned if not h.cause)
     listed = [f"{brief(reason, 80)} ({n})" for reason, n in own.most_common(3)]
     if len(own) > len(listed):
@@ -155,8 +155,8 @@ def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
 
 
 def dot(graph: Graph, result: Result) -> str:
-    """Return a box for each stage with the number of its tasks, an arrow for each stage that one reads, and a title
-    where more is to follow."""
+    """Graphviz text: a box for each stage with the number of its tasks, an arrow for each stage that it reads, and a
+    title if there are unknown tasks."""
     tasks = Counter(handle.stage for handle in graph.nodes)
     arrows = dict.fromkeys((source.stage, handle.stage) for handle in graph.nodes for source in handle.upstream())
     boxes = (f'  "{stage}" [label="{stage} x {count}"];' for stage, count in tasks.items())

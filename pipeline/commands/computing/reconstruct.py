@@ -36,7 +36,7 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
 
 
 def _perform(seq: str, options: Options) -> tuple[int, Path]:
-    """Run a sequence, or the run of a crate anew; the exit code and the folder of the results."""
+    """Run a sequence, or the run of a crate again; return the exit code and the folder of the results."""
     crate = rocrate.read(Path(seq))
     if crate is not None:
         frames = crate.options.get("--frames", (None,))[-1]

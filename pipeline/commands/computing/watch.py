@@ -1,4 +1,4 @@
-"""``rille watch``: a sequence whose images are still arriving, reconstructed again and again out of the cache."""
+"""``rille watch``: reconstruct a sequence repeatedly, with the cache, while its images arrive."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rille.pipeline.runs.options import HOLES, INTERRUPTED, WatchOptions, cache_
 from rille.stages.core.errors import ConfigError, IncompleteError, InputError, RilleError
 
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
-"""Files that each update makes; all others, COLMAP's trajectory and the figures follow at the end."""
+"""Files of each update; all others, COLMAP's trajectory and the figures follow at the end."""
 
 
 def watch(seq: str, *, options: WatchOptions = WatchOptions()) -> int:
@@ -55,7 +55,7 @@ def watch(seq: str, *, options: WatchOptions = WatchOptions()) -> int:
 
 
 class _Seen(NamedTuple):
-    """A sequence as it is by now; ``frames`` of it may be taken, and ``files`` are the digests of their images."""
+    """A sequence as it has arrived; ``frames``: number of usable frames; ``files``: digests of their images."""
 
     sequence: Sequence
     frames: int
@@ -64,12 +64,12 @@ class _Seen(NamedTuple):
 
 @dataclass
 class _Watched:
-    """What has been seen of a sequence, and taken; ``folder`` of the last results.
+    """State of a watch: the sequence as seen and as reconstructed, and ``folder`` of the last results.
 
     Attributes
     ----------
-    said : lines that were printed on stderr: every update has the same warnings.
-    gaps : when it was first seen, by the monotonic clock, that a frame between others is missing, by its name.
+    said : lines that were printed on stderr, because every update has the same warnings.
+    gaps : time, by the monotonic clock, when a frame between others was first missing, by its name.
     """
 
     seq: str
@@ -82,7 +82,7 @@ class _Watched:
     gaps: dict[str, float] = field(default_factory=dict)
 
     def to_the_end(self) -> int:
-        """Update until nothing is to be waited for, and reconstruct everything; the exit code."""
+        """Update until the end of the watch, then reconstruct everything; return the exit code."""
         while True:
             begin = time.monotonic()
             seen, took = self.look(), time.monotonic() - begin
@@ -91,15 +91,15 @@ class _Watched:
             elif self.is_over(seen):
                 return self.finish()
             else:
-                time.sleep(max(0.25, 5 * took))  # looking takes a fifth of the time at most
+                time.sleep(max(0.25, 5 * took))  # looking takes at most a sixth of the time
 
     def look(self) -> _Seen | None:
-        """Open the sequence as far as it has arrived; None where that is not enough to open it.
+        """Open the sequence as far as it has arrived; None if that is not enough to open it.
 
         Raises
         ------
         InputError
-            It cannot be opened, whatever else may arrive.
+            It cannot be opened, whatever may still arrive.
         ConfigError
             Its images are no files.
         """
@@ -108,14 +108,14 @@ class _Watched:
         except InputError as error:
             if self.taken is None and not isinstance(error, IncompleteError):
                 raise
-            # Files that still change are not counted: whether one is missing is known once all are at rest.
+            # While files change it is unknown whether one is missing.
             if time.monotonic() - self.arrivals.changed > SETTLE_SECONDS:
                 self.say(f"rille: waiting: {error.message}")
             return None
         now = time.monotonic()
         names = {sequence.frame_names[k]: k for k in sequence.lost}
         self.gaps = {name: self.gaps.get(name, now) for name in names}
-        # 10.0 seconds: time for which a pair between others is waited for; then it counts as lost until it is there.
+        # 10.0 seconds: time to wait for a missing pair between others, which then counts as lost until it arrives.
         frames = min((names[n] for n, t in self.gaps.items() if now - t < 10.0), default=sequence.frames)
         if frames < sequence.frames:
             self.say(f"rille: waiting: {sequence.lost[frames]}")
@@ -123,18 +123,18 @@ class _Watched:
         return _Seen(sequence, frames, {Path(image.hints["path"]): image.args["sha256"] for image in images})
 
     def is_more(self, seen: _Seen) -> bool:
-        """Whether there is something new, and nothing less than before: what is written anew will be there again."""
+        """Whether there is something new, and nothing less than before, as while files are written anew."""
         before = self.taken
         return bool(seen.files) and (before is None or (seen.frames >= before.frames and seen.files != before.files))
 
     def is_over(self, seen: _Seen | None) -> bool:
-        """Whether no more is to be waited for."""
+        """Whether the watch has ended."""
         idle, count = self.options.until_idle, self.options.count
         enough = count is not None and seen is not None and len(seen.files) >= 2 * count
         return enough or (idle is not None and time.monotonic() - self.arrivals.changed >= idle)
 
     def update(self, seen: _Seen) -> None:
-        """Reconstruct what may be taken; an error is printed, and more is waited for."""
+        """Reconstruct the usable frames; after an error, which is printed, the watch goes on."""
         before, self.taken = {} if self.taken is None else self.taken.files, seen
         replaced = [path.name for path, digest in seen.files.items() if before.get(path, digest) != digest]
         if replaced:
@@ -154,7 +154,7 @@ class _Watched:
         print(f"{len(seen.files) // 2} pairs, {since:.1f} s after the last file: {result.lines[0]}", flush=True)
 
     def finish(self) -> int:
-        """Reconstruct all that has arrived, as ``rille reconstruct`` does; the exit code."""
+        """Reconstruct all that has arrived, as ``rille reconstruct`` does; return the exit code."""
         left_out = []
         self.arrivals.growing = False
         try:
@@ -162,7 +162,7 @@ class _Watched:
         except InputError as error:
             if self.taken is None:
                 raise
-            # A run refuses images without a partner, or a table with more rows: not all has arrived.
+            # Not all has arrived: a run would refuse images without a partner, or a table with more rows.
             self.arrivals.growing = True
             sequence = open_sequence(self.seq, digests=self.arrivals)
             left_out = [error.message]
@@ -174,7 +174,7 @@ class _Watched:
         return HOLES if left_out else result.code
 
     def run(self, options: WatchOptions, seen: _Seen) -> session.RunResult:
-        """Run, with a folder that takes the place of that of the run before."""
+        """Run, and replace the folder of the run before."""
         options = replace(options, frames=None if seen.frames == seen.sequence.frames else f"0:{seen.frames}")
         result = session.perform(seen.sequence, options, kept=self.kept, warn=lambda line: self.say(warned(line)))
         if self.folder is not None:
@@ -183,7 +183,7 @@ class _Watched:
         return result
 
     def say(self, line: str) -> None:
-        """Print a line on stderr that was not printed before."""
+        """Print a line on stderr, unless it was printed before."""
         if line not in self.said:
             self.said.add(line)
             print(line, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""``rille compare A B``: which parameters, tasks, figures and positions of two runs differ."""
+"""``rille compare A B``: differences of parameters, tasks, figures and positions of two runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
     Their elevations: rille compare-dem A B.
     """
     one, other = both = lookup.find(a, runs), lookup.find(b, runs)
-    # All before anything is printed: where something cannot be read there is no half of a comparison.
+    # Read all before anything is printed.
     with lookup.reading(*both):
         reports = [api.Run(run).report for run in both]
         settings = [dict(dotted(read_toml(run / "config.toml", "configuration"))) for run in both]
@@ -43,9 +43,9 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _tasks(a: Path, b: Path) -> Iterator[str]:
-    """Counts by stage: tasks with another result, and those of which one run alone or neither has a result."""
+    """Counts by stage: tasks with another result, and tasks with a result in one run alone, or in neither."""
     ledgers = [{row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b)]
-    # A task that failed or was left out has no digest.
+    # A failed or skipped task has no digest.
     digests = {label: tuple(rows.get(label, {}).get("digest") for rows in ledgers) for label in ledgers[0] | ledgers[1]}
     fates = {label: _fate(*pair) for label, pair in digests.items()}
     total = Counter(fates.values())
@@ -61,11 +61,11 @@ def _fate(a: str | None, b: str | None) -> str:
 
 
 def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
-    """Figures of the report that differ or that one run alone has; times are no results."""
+    """Figures of the report, without times, that differ or that one run alone has."""
     one, other = ({k: m for k, m in report["metrics"].items() if k != "wall_clock"} for report in (a, b))
     both = [name for name in one if name in other]
     words = {n: tuple(quantity(m[n]["value"], m[n]["unit"]) for m in (one, other)) for n in both}
-    # Compared in words, of three digits: what differs only beyond would read as "12.3 -> 12.3".
+    # Compared in words, of three digits, to avoid "12.3 -> 12.3".
     differ = [name for name, (before, after) in words.items() if before != after]
     yield f"figures       {len(both) - len(differ)} equal to three digits, {len(differ)} differ"
     yield from (f"  {one[name]['label']}: {' -> '.join(words[name])}" for name in differ)

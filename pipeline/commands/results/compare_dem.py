@@ -93,7 +93,7 @@ def compare_dem(
 
 
 def _placed(paths: Sequence[Path], one: DemFile, other: DemFile) -> tuple[Floats, dict[str, Any]]:
-    """Motion (2, 3) of x, y that lays the terrain of a run on that of another, and its facts for the JSON file."""
+    """Motion (2, 3) of x, y that aligns the terrain of a run with that of another, and its facts for the JSON file."""
     files = [path for path in paths if not path.is_dir()]
     if files:
         text = f"{files[0]} is no run: it has no ortho image"
@@ -114,14 +114,14 @@ def moved(dem: DemFile, motion: Floats) -> DemFile:
 
 
 def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats, Grid]:
-    """All figures (JSON-able) of A against the reference B, the error, m, on the common cells (rows, cols), B on them.
+    """Figures (JSON-able) of A against the reference B, errors, m, on the common cells (rows, cols), and B on them.
 
     Raises
     ------
     InputError
-        No cell is left that both know.
+        There is no common known cell.
     DegenerateError
-        The alignment that was asked for is not determined.
+        The terrain does not determine the alignment.
     """
     on_a, on_b, how = evaluation.common(a.grid, b.grid)
     missing_crs = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
@@ -151,7 +151,7 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
 
 
 def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of what rose or fell."""
+    """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of the changes."""
     sigma = [np.zeros(error.shape) if one.sigma is None else one.grid.at(grid.centres(), one.sigma) for one in (a, b)]
     deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
     found = dem_changes.changes(error, deviation, grid)
@@ -169,7 +169,7 @@ def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[
 
 
 def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
-    """Lines on what rose or fell, the greatest volumes first."""
+    """Lines on the changes, the greatest volumes first."""
     yield ""
     for way, total in changes["total"].items():
         yield f"{way:5s} {1e6 * total['volume_m3']:.4g} +- {1e6 * total['sigma_m3']:.2g} cm3"
@@ -205,7 +205,7 @@ def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
 
 
 def _completeness(error: Floats, on_b: Grid, a: DemFile) -> dict[str, Any]:
-    """Share of the cells of B that could be compared: of all, and of those whose centres lie in the outline of A."""
+    """Share of compared cells of B: of all, and of those whose centres lie in the outline of A."""
     compared, known, index = int(np.isfinite(error).sum()), np.isfinite(on_b.values), a.grid.index(on_b.centres())
     inside = ((index >= -0.5) & (index <= np.array(a.grid.values.shape) - 0.5)).all(axis=-1)
     within = int((known & inside).sum())
@@ -218,7 +218,7 @@ def _completeness(error: Floats, on_b: Grid, a: DemFile) -> dict[str, Any]:
 
 
 def _by_range(error: Floats, target: Grid, a: DemFile, b: DemFile) -> dict[str, Any]:
-    """Errors by the horizontal distance from the nearest camera; no bins where no camera is known."""
+    """Errors by the horizontal distance from the nearest camera; no bins if no camera is known."""
     cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
     unit = "m, from the nearest position of the left camera"
     if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
@@ -227,12 +227,12 @@ def _by_range(error: Floats, target: Grid, a: DemFile, b: DemFile) -> dict[str, 
         return {"unit": "no camera is known: give the folder of a run for A or B", "bins": []}
     distance = np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64)
     far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
-    # Bins are open at their upper end: a hair more keeps the farthest cell in the last one.
+    # Bins are open at their upper end: 1e-9 more, so that the last one holds the farthest cell.
     return {"unit": unit, "bins": evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))}
 
 
 def _lines(figures: Mapping[str, Any]) -> Iterator[str]:
-    """What is printed of the figures."""
+    """Printed lines of the figures."""
     for name, word in (("a", ""), ("b", ", the reference")):
         yield f"{name.upper()}  {figures[name]['path']}  {figures[name]['cell_m']:g} m cells{word}"
     yield f"cells: {figures['resampling']}; errors are A minus B"

@@ -58,7 +58,7 @@ def export(
         try:
             with lookup.reading(folder):
                 print(f"{path}  {export_run(form, folder, path, store, **thinning)}")
-        except RilleError as error:  # what one form lacks, the others may do without
+        except RilleError as error:  # other forms may not need what this one lacks
             if form == to[-1]:
                 raise
             code = complain(error)

@@ -1,4 +1,4 @@
-"""``rille localize RUN DEM``: where the terrain of a run lies in a map, with covariance, or that this is ambiguous."""
+"""``rille localize RUN DEM``: place of a run's terrain in a map, with covariance, unless it is ambiguous."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from rille.stages.terrain.map_localization import MapLocalizationParams, Placeme
 from rille.stages.terrain.relief.grid import Grid
 
 MAP_CRS = ENGINEERING_CRS.replace("Rille world frame", "frame of a map")
-"""Of coordinates of a map that states no system."""
+"""CRS for coordinates of a map that states none."""
 
 TURN_DEG = 20.0
 """Degrees to either side of a given heading that are searched."""
@@ -82,7 +82,7 @@ class Area:
 
 
 def numbers(placed: Placement) -> dict[str, tuple[float, float]]:
-    """What is known of a place, by name, with its standard deviation: position, tilts about the map's axes, yaw."""
+    """Known numbers of a place by name, with standard deviations: position, tilts about the map's axes, yaw."""
     R, sigma = placed.pose.rotation, np.sqrt(np.diag(placed.covariance))
     heading = heading_of(placed.pose)
     tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
@@ -112,7 +112,7 @@ def table(placed: Placement) -> Iterator[str]:
 
 
 def about(figures: Mapping[str, Any]) -> Iterator[str]:
-    """Lines on how a place was found."""
+    """Lines on the registration of a place."""
     if "cells" in figures:
         relief = f"RMS {figures['rms']:.3g} m, {max(figures['explained'], 0.0):.0%} of the relief explained"
         cells = f"{figures['cells']} cells ({figures['independent']:.0f} independent)"
@@ -168,7 +168,7 @@ def localize(
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
-    # Where the place is not known now, files of an earlier one would be taken for its.
+    # Files of an earlier place would be taken for those of this run.
     for ending in (".tum", ".gpkg"):
         output_file(output, ending).unlink(missing_ok=True)
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
@@ -186,12 +186,12 @@ def localize(
 
 
 def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Placement:
-    """Place by the ortho images, where there is one; then by the elevations, where there are some.
+    """Place by the ortho images, if there is one; then by the elevations, if there are any.
 
     Raises
     ------
     DegenerateError
-        They tell none.
+        They do not determine the place.
     """
     by_ortho = None
     if image is not None:
@@ -213,7 +213,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
     if by_ortho is not None:
         # Elevations and ortho images must agree on a place within ten cells of the map.
         around = SearchArea(*from_above(by_ortho.pose), 10.0 * model.grid.cell, math.radians(TURN_DEG))
-    # Standard deviation, degrees, of a vertical that a sensor gives, and of one that is that of the ground.
+    # Standard deviation, degrees, of a vertical by a sensor, and of one by the ground.
     tilt = 0.5 if terrain.vertical == "attitude" else 5.0
     params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
     found = fix(terrain.grid, model.grid, around, params)
@@ -221,7 +221,7 @@ def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: 
 
 
 def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store) -> Iterator[Path]:
-    """Write trajectory and path in the map's coordinates; gives the files."""
+    """Write trajectory and path in the map's coordinates; yield the files."""
     words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {output_file(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
         known = api.Run(folder).trajectory

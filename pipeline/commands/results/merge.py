@@ -48,7 +48,7 @@ class Session:
     facts: Mapping[str, Any]
 
     def covered(self, cell: float) -> Lattice:
-        """What of the first run's lattice it may cover."""
+        """Part of the first run's lattice that it may cover."""
         x0, x1, y0, y1 = self.terrain.lattice.bounds
         x, y, _ = self.pose.apply([[x, y, self.level] for x in (x0, x1) for y in (y0, y1)]).T
         return Lattice.snap((x.min(), x.max(), y.min(), y.max()), cell)
@@ -84,7 +84,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     layers += [_laid(number, first, one) for number, one in enumerate(sessions, start=1)]
     merged = merge_layers(layers, lattice, MergeParams.model_validate({}))
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
-    # First, for by it the folder is known as ours, and the same command goes on after a kill.
+    # First, since it marks the folder as ours, so that the same command can continue after a kill.
     facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
     atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
     for name, band, values, unit in (
@@ -104,17 +104,17 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
 
 
 def _registered(first: Terrain, other: Terrain) -> Session:
-    """Lay a run on the first one.
+    """Register a run to the first one.
 
     Raises
     ------
     DegenerateError
-        Neither their ortho images nor their relief show a place that both share, or they show several.
+        Neither ortho images nor relief determine one common place.
     InputError
         Their cells are too unlike, or they have no ground in common.
     """
     ratio = other.lattice.cell / first.lattice.cell
-    # 1.5: ratio of two runs' cell sizes: coarser cells would be interpolated between, finer ones left out.
+    # 1.5: largest ratio of two runs' cell sizes, since the merge interpolates in coarser cells and skips finer ones.
     if not 1.0 / 1.5 < ratio < 1.5:
         text = f"cells of {other.name} are {other.lattice.cell:g} m wide, of {first.name} {first.lattice.cell:g} m"
         raise InputError("RIL-851", text, remedy=f"run one again with --set locus.cell_size={first.lattice.cell:g}")
@@ -130,11 +130,11 @@ def _registered(first: Terrain, other: Terrain) -> Session:
         text = f"elevations do not tell how {other.name} lies: it is as the georeferences state, without a sigma"
         warn(warning("RIL-855", text))
         alignment = Alignment(start, start.apply(other.grid.points()[shared]).mean(axis=0), np.zeros(6))
-    # Errors of neighbours are alike: there are fewer than cells.
+    # Errors of neighbours correlate: there are fewer independent ones than cells.
     sigma = alignment.sigma * math.sqrt(shared.sum() / max(independent_cells(error), 1.0))
     rough = np.sqrt(np.diag(placed.covariance))
     sigma = np.where((sigma == 0.0) & np.isfinite(rough), rough, sigma)
-    # Georeferences are believed within three standard deviations: lattices that fit are then not resampled.
+    # Within three standard deviations georeferences are used unchanged, without resampling if the lattices fit.
     moved, pose = alignment.pose @ start.inverse(), alignment.pose
     motion = np.array([*(moved.apply(alignment.centre) - alignment.centre), *rotation_log(moved.rotation)])
     by = placed.by
@@ -153,7 +153,7 @@ def _registered(first: Terrain, other: Terrain) -> Session:
 
 
 def _placed(first: Terrain, other: Terrain) -> Placement:
-    """Where a run lies in the first one: as the georeferences of both state, else by ortho images or relief."""
+    """Placement of a run in the first one by the georeferences of both, else by ortho images or relief."""
     a, b = first.place, other.place
     if a is None or b is None:
         return register((other.image, first.image), (other.grid, first.grid))
@@ -167,7 +167,7 @@ def _in_system(place: Georeference) -> RigidTransform:
 
 
 def _aligned(one: Grid, two: Grid, start: RigidTransform) -> Alignment | None:
-    """Motion of the first grid onto the second; height and tilt alone change where the terrain tells no more."""
+    """Motion of the first grid onto the second, of height and tilt alone if the terrain determines no more."""
     for kind in ("rigid", "tilt"):
         with suppress(DegenerateError):
             return dem_comparison.align(one, two, kind, start)
@@ -177,18 +177,18 @@ def _aligned(one: Grid, two: Grid, start: RigidTransform) -> Alignment | None:
 def _layer(
     number: int, lattice: Lattice, arrays: Mapping[str, Floats], gain: float = 1.0, pose: Placed = EXACT
 ) -> ModelLayer:
-    """A layer of the merge; its residuals are in its standard deviations already."""
+    """A layer of the merge, whose standard deviations include its residuals."""
     parts = {name: values.astype(np.float32) for name, values in arrays.items()}
     parts["residual"] = np.zeros(lattice.shape, np.float32)
     return ModelLayer(number, lattice, lambda name, window: parts[name][window], gain, pose)
 
 
 def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
-    """The terrain of a run on the first one's lattice, interpolated once, with the sigma of where it lies."""
+    """The terrain of a run on the first one's lattice, interpolated once, with the sigma of its placement."""
     terrain, lattice, pose = session.terrain, session.covered(first.lattice.cell), session.pose
     grid, back, xy = terrain.grid, session.pose.inverse(), lattice.xy()
     z = np.full(lattice.shape, float(pose.apply([0.0, 0.0, session.level])[2]))
-    # The point of a tilted model above a cell is found in rounds: its height moves it by less each time.
+    # The point of a tilted model above a cell depends on its height: fixed-point iteration.
     for _ in range(4):
         own = back.apply(np.concatenate([xy, z[..., None]], axis=-1))[..., :2]
         there = grid.at(own)
@@ -211,7 +211,7 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
 
 
 def _line(one: Session) -> str:
-    """How a run was laid, and how far it differs."""
+    """Line on the registration of a run and its differences."""
     x, y, z = one.pose.translation
     overlap = one.facts["overlap"]
     turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])

@@ -1,8 +1,8 @@
 """``rille rig``: one rig from the matches of several runs, for manifests to pin.
 
-Each run repairs its rig by its own images; pieces of one log then differ a little in theirs. Here the matches of all
-runs decide together which parameters depart from the calibration, as those of all pairs do in a run. The value of each
-is the mean of the runs' own estimates, weighted by their covariances.
+Each run repairs its rig by its own images, so that rigs of pieces of one log differ a little. Here the matches of all
+runs together decide which parameters depart from the calibration, as those of all pairs do in a run. The value of each
+parameter is the mean of the runs' own estimates, weighted by their covariances.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _matches(artifacts: RunArtifacts) -> Iterator[PointPairs]:
 
 
 def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigParams) -> Joint:
-    """Return the rig of several runs: the given one, corrected where the matches of all together contradict it.
+    """The rig of several runs: the given one, corrected where the matches of all together contradict it.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigPa
 
 
 def disagreements(found: Joint, significance: float) -> Iterator[str]:
-    """Lines on what runs estimate otherwise than all together, by more than ``significance`` standard deviations."""
+    """Lines on estimates of runs that differ from the joint one by more than ``significance`` standard deviations."""
     for k, parameter in enumerate(found.parameters):
         centre = parameter.asked if not parameter.freed else found.values[k]
         for one in found.estimates if parameter.observed else ():
@@ -155,7 +155,7 @@ def _table(found: Joint) -> Iterator[str]:
     yield "  ".join([f"{'degrees':17s}", *(f"{head:>17.17s}" for head in ["all", *heads])])
     for k, p in enumerate(found.parameters):
         value = found.values[k] if p.freed else p.asked
-        # Where no image shows a parameter, its estimate would be the prior.
+        # The estimate of a parameter that is not observed would be the prior.
         own = [(one.values[k], one.sigma[k]) for one in found.estimates if p.observed]
         each = [(value, p.sigma), *own]
         cells = "  ".join(f"{math.degrees(v):+8.3f} +- {math.degrees(s):.3f}" for v, s in each)

@@ -1,4 +1,4 @@
-"""The merged terrain of a finished run, as commands read it that lay runs on maps or on each other."""
+"""The merged terrain of a finished run, for commands that register runs to maps or to each other."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rille.stages.terrain.relief.grid import Grid
 class Terrain:
     """Merged terrain of a run: elevations, their standard deviations, m, and grey values (row, col) on ``lattice``.
 
-    ``place`` of the world frame, where the run has one; ``vertical``: source of the world's vertical.
+    ``place`` of the world frame, if the run has one; ``vertical``: source of the world's vertical.
     """
 
     name: str
@@ -35,12 +35,12 @@ class Terrain:
 
     @staticmethod
     def of(folder: Path) -> Terrain:
-        """Read it from the folder of a run.
+        """Terrain in the folder of a run.
 
         Raises
         ------
         InputError
-            The run has none, or its elevations are none of ground.
+            The run has none, or its elevations are not those of ground.
         """
         run, name = Run(folder), lookup.name(folder)
         terrain = run.terrain

@@ -1,4 +1,4 @@
-"""``rille runs``, ``timing`` and ``view``: the list of all runs, where the time of one went, and its report."""
+"""``rille runs``, ``timing`` and ``view``: the list of all runs, the time of one by stage, and its report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             rows = (row for row in events.read(run / lookup.LEDGER) if row["label"] not in outdated)
             statuses = Counter(row["status"] for row in rows)
             missing = statuses["failed"] + statuses["skipped"]
-            # "ok": all tasks have ended; "total": the files and the report are written, too.
+            # "ok": all tasks have ended; "total": files and report are written too.
             whole = "unfinished" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
             state = "unfinished" if "ok" not in facts else f"{missing} missing" if missing else whole
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
@@ -80,11 +80,11 @@ def by_stage(run: Path) -> Iterator[str]:
 
 def view(run: Run = "latest", *, runs: Runs = RUNS) -> int:
     """Open the report of a run in the browser; print its path."""
-    from rille.pipeline import api  # it imports NumPy, for which a list need not wait
+    from rille.pipeline import api  # imports NumPy, which a list does not need
 
     opened = api.open_run(run, runs)
     page = opened.file("report.html")
-    # Over SSH there may be a text browser, which would take the terminal.
+    # Over SSH a text browser might take the terminal.
     if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         opened.show()
     print(page)

@@ -1,4 +1,4 @@
-"""``rille why RUN [TASK]``: where results come from, and what has changed since the run before."""
+"""``rille why RUN [TASK]``: origin of results, and changes since the run before."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Run, Runs, cache_folder
 
 SHORT_DIGITS = 12
-"""Hexadecimal digits of a digest that are shown."""
+"""Shown hexadecimal digits of a digest."""
 
 MAX_INPUTS = 8
-"""Inputs of one port that are listed; more are counted."""
+"""Listed inputs of a port; more are counted."""
 
 WIDTH = 70
-"""Characters of a value."""
+"""Most characters of a value."""
 
 
 def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFolder = None) -> int:
@@ -44,12 +44,12 @@ def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFol
 
 
 def summary(run: Path) -> Iterable[str]:
-    """Lines on all tasks of a run: how many of each stage ended in which way, and for what reason."""
+    """Lines on all tasks of a run: their number by stage, outcome and reason."""
     rows = events.read(run / lookup.LEDGER)
     yield f"{len(rows)} tasks in run {lookup.name(run)}"
     groups: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
-        # Cached ones have one reason, which needs no words.
+        # Cached tasks need no reason.
         reason = "" if row["status"] == "cached" else brief(row.get("reason", ""), WIDTH)
         groups.setdefault((row["stage"], row["status"], reason), []).append(row["label"])
     for (stage, status, reason), labels in groups.items():
@@ -97,7 +97,7 @@ def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None, sto
 
 
 def _computed_by(row: Mapping[str, Any], run: Path) -> str:
-    """Which kept run computed it."""
+    """The kept run that computed it, in words."""
     for before in lookup.earlier(run, of_any=True):
         for other in events.read(before / lookup.LEDGER):
             if other.get("key") == row.get("key") and other["status"] == "computed":
@@ -136,9 +136,9 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-    """Section of the configuration that a stage's parameters are set in, and its defaults.
+    """Section of the configuration with a stage's parameters, and its defaults.
 
-    Several stages share one, as those of a tile share the matcher's: then its keys are theirs.
+    Several stages may share a section, as those of a tile share the matcher's.
     """
     known = build().model_dump(mode="json")
     shared = (name for name, values in known.items() if values.keys() == params.keys())
@@ -147,8 +147,7 @@ def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, A
 
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
-    """What is different from the last run before that had this task."""
-    # Compare with the last run that had the task; differences from earlier runs are for that run's own `why`.
+    """Differences from the last earlier run that had this task."""
     for before in lookup.earlier(run):
         rows = events.read(before / lookup.LEDGER)
         other = next((r for r in rows if r["label"] == row["label"] and "key" in r), None)

@@ -1,1 +1,1 @@
-"""Commands that look at a sequence, or at pictures, before anything is reconstructed."""
+"""Commands on a sequence, or on images, before a reconstruction."""

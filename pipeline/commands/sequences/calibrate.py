@@ -1,4 +1,4 @@
-"""``rille calibrate``: pictures of a chessboard to a stereo rig, with each view's residual and each parameter's error.
+"""``rille calibrate``: a stereo rig from images of a chessboard, with residuals of views and errors of parameters.
 
 The result is an OpenCV YAML file, which manifests take: ``[cameras] file = "rig.yaml"``.
 """
@@ -33,7 +33,7 @@ Image = NDArray[Any]
 
 @dataclass
 class Boards:
-    """Boards in the images of two sizes: ``views``, and in ``left_out`` name and reason of pairs of no use."""
+    """Boards in the images of two sizes: ``views``, and in ``left_out`` name and reason of unusable pairs."""
 
     corners: tuple[int, int]
     sizes: Sizes
@@ -41,7 +41,7 @@ class Boards:
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
     def take(self, name: str, images: Sequence[Image]) -> str:
-        """Add the view of a pair of images; why it is of no use otherwise."""
+        """Add the view of a pair of images; return why it is unusable, if it is."""
         if tuple(image.shape[::-1] for image in images) != self.sizes:
             most = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(self.sizes))
             return f"its images are not {most} pixels as most are"
@@ -50,7 +50,7 @@ class Boards:
             missing = [side for side, points in zip(CAMERAS, (left, right), strict=True) if points is None]
             return f"no whole board in the {' nor in the '.join(missing)} image"
         view = BoardView(name, left, chessboard.same_order(left, right, self.corners))
-        # Of one place: noise moves all corners by tenths of a pixel, a hand by many pixels.
+        # Below 1 pixel the board has not moved: noise moves corners by tenths of a pixel, a hand by many pixels.
         same = next((other.name for other in self.views if _distance(view, other) < 1.0), None)
         if same is not None:
             return f"the board stands as in view {same}"
@@ -91,11 +91,11 @@ def calibrate(
     if output.exists() and "avg_reprojection_error:" not in read_text(output, "calibration"):
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
-    chessboard.board_points((3, 3), square)  # a wrong unit is said before minutes of detection
+    chessboard.board_points((3, 3), square)  # refuses a wrong unit before minutes of detection
     pictures = _files(left, right)
     try:
         pairs = pairing.pair_up(*pictures, gaps=True)
-    except InputError as error:  # its remedies are keys of a manifest
+    except InputError as error:  # its remedy is for manifests
         remedy = "give both pictures of a pair one name or number, each side in a folder or glob of its own"
         raise InputError(error.code, error.message, remedy=remedy) from error
     boards = find_boards(pairs, given)
@@ -114,7 +114,7 @@ def calibrate(
 
 
 def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
-    """Image files of both sides; the same folder for both where the names tell the sides."""
+    """Image files of both sides; one folder may serve both if the names tell the sides."""
     lefts, rights = _images(left), _images(right)
     if left == right:
         sides = {path: (pairing.side_of(path.stem) or (0, -1))[1] for path in lefts}
@@ -127,7 +127,7 @@ def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
 
 def _images(place: Path) -> list[Path]:
     """Image files of a folder, a glob or a single path."""
-    # glob passes over hidden files, which macOS adds to archives.
+    # glob skips hidden files, which macOS adds to archives.
     pattern = f"{glob.escape(str(place))}/*" if place.is_dir() else str(place.expanduser())
     images = sorted(Path(path) for path in glob.glob(pattern) if path.lower().endswith(SUFFIXES))
     if not images:
@@ -137,7 +137,7 @@ def _images(place: Path) -> list[Path]:
 
 
 def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | None) -> Boards:
-    """The board in all pairs; its size is determined where it is not given.
+    """The board in all pairs; its size is detected if it is not given.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     whole = [p for p in pairs if not p.absent]
     images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in whole}
     sizes = {name: tuple(image.shape[::-1] for image in both) for name, both in images.items()}
-    # One picture of another size is a slip; the others still calibrate.
+    # A few images may have another size by mistake; the others still calibrate.
     usual: Any = Counter(sizes.values()).most_common(1)[0][0]
     if corners is None:
         corners = chessboard.find_size(image for name in images if sizes[name] == usual for image in images[name])
@@ -174,8 +174,8 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     columns, rows = boards.corners
     grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
     spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    # 0.1: residual over the spacing of the corners from which they are not those of a flat board: print errs by
-    # hundredths. It holds for any resolution and distance of the board.
+    # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
+    # hundredths; at any resolution and distance.
     if rig.rms > 0.1 * spacing:
         raise InputError(
             "RIL-800",
@@ -193,14 +193,14 @@ def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float
 
 def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
     """Reasons to doubt the result, one line each with its figure."""
-    # More than a chessboard on paper leaves.
+    # 1.0 px: a chessboard on paper leaves less.
     if rig.rms > 1.0:
         text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
         yield warning("RIL-696", text)
     used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
     for side, size in zip(CAMERAS, boards.sizes, strict=True):
         share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
-        # All depths err by as much.
+        # 0.01: all depths have this relative error.
         if share > 0.01:
             text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
             yield warning("RIL-697", text)
@@ -212,7 +212,7 @@ def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
         known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
         vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
         if vague:
-            # A model with fewer terms, which these views may determine.
+            # These views may determine a model with fewer terms.
             fewer = "radtan" if model == "rational" else "radtan4"
             text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
             yield warning("RIL-699", text)
@@ -230,7 +230,7 @@ def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:
 
 
 def _parameters(rig: RigCalibration) -> Iterator[str]:
-    """Table of parameters, each with its standard deviation; the right camera's pose is that from the left one."""
+    """Table of parameters, each with its standard deviation."""
     units = {"baseline": "m", "rotation": "rad", **dict.fromkeys(("fx", "fy", "cx", "cy"), "px")}
     for name, value in rig.values.items():
         whole, _, part = name.partition(" ")
@@ -240,7 +240,7 @@ def _parameters(rig: RigCalibration) -> Iterator[str]:
 
 
 def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
-    """The file's text: keys as OpenCV's stereo samples have them, then how it was found, residuals in pixels RMS."""
+    """The file's text: keys of OpenCV's stereo samples, then board and residuals (pixels RMS)."""
     left, right = boards.sizes
     sizes = {"image_width": left[0], "image_height": left[1]}
     unlike = {"image_size1": np.array(left), "image_size2": np.array(right)}
@@ -258,11 +258,11 @@ def _yaml(rig: RigCalibration, boards: Boards, square: float) -> str:
         "avg_reprojection_error": rig.rms,
     }
     for name, used in (("views", True), ("views_left_out", False)):
-        # OpenCV escapes an apostrophe in a way that YAML does not know.
+        # OpenCV escapes an apostrophe in a way that is not YAML.
         views = [vars(r) | {"name": r.name.replace("'", "_")} for r in rig.residuals if r.used == used]
         content[name] = {f"view_{k}": {n: v for n, v in view.items() if n != "used"} for k, view in enumerate(views)}
     content["standard_deviations"] = {name.replace(" ", "_"): value for name, value in rig.sigma.items()}
-    # In memory: the file is written by Python, whose errors say what is wrong.
+    # In memory, since errors of Python's writing say what is wrong.
     file = cv2.FileStorage("rig.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     file.writeComment("x_right = R x_left + T, square in metres; board in inner corners; residuals in pixels RMS")
     _store(file, content)

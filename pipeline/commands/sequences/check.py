@@ -1,7 +1,7 @@
-"""``rille check``: open everything of a sequence, match its first pair, and say in one line each what to expect.
+"""``rille check``: open everything of a sequence, match its first pair, and print one line for each finding.
 
-Images, disparity and motions are the tasks of a reconstruction with the same parameters, made by the same builder: what
-is computed here is cached for it.
+Images, disparity and motions are tasks of a reconstruction with the same parameters, by the same builder, and so cached
+for it.
 """
 
 from __future__ import annotations
@@ -66,16 +66,16 @@ def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Pat
         try:
             store.writable()
         except StoreError as error:
-            # A check of data on a disk that is read only, say.
+            # For example a read-only disk.
             kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
             store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
         name_graph(graph, sequence, frames)
         inspection = Inspection(Builder(graph, sequence, config), frames, store)
         inspection.say(*kept)
         graph.flow(inspection.steps())
-        # In this process: workers would take longer to start than most of this takes.
+        # In this process, because the start of workers would take longer than most tasks.
         result = run(graph, store, RunOptions(executor="inline", keep_going=True))
-    # What a stage refuses is a finding, said by then; any other failure is one of the program.
+    # Errors of stages are findings, already printed; any other failure is a fault of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
     levels = inspection.levels
     print(f"{sequence.name}: {levels['FAIL']} fail, {levels['WARN']} to look at, {levels['OK']} fine")
@@ -103,7 +103,7 @@ class Inspection:
         self.say(Finding(error.code, f"{where}{error.message}", subject, "FAIL", error.remedy))
 
     def steps(self) -> Steps:
-        """Look at everything, the cheap things first."""
+        """Check everything, the cheap things first."""
         s = self.sequence
         self.say(judge.judge("sequence", f"{s.name}, {len(self.frames)} of {s.frames} pairs"))
         for frame, why in self.lost.items():
@@ -143,13 +143,13 @@ class Inspection:
             looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
             if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
                 self.broken.add((frame, camera))
-        # The others are counted.
+        # More are only counted.
         for refusal in errors[:3]:
             self.refused(refusal, "images")
         whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
         text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
-        # Images of one grey value say the same of any scene.
+        # Images of one grey value do not count as repeated.
         several = {c: {k: one["digest"] for k, one in of.items() if one["deviation"]} for c, of in looks.items()}
         self.say(*self._repeated(several))
         self.say(*judge.judge_looks(looks, self.sequence.frame_names, self.make.config.frame_screening))
@@ -197,7 +197,7 @@ class Inspection:
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 
     def _times(self, whole: list[int]) -> Steps:
-        """Whether left and right are of one time; where they are not, from which pair on."""
+        """Whether left and right images are simultaneous; if not, from which pair on."""
         chosen, between = list[int](), whole
         while between:
             chosen = sorted({*chosen, *spread(between, 6)})
@@ -209,7 +209,7 @@ class Inspection:
 
     def _motions(self) -> Steps:
         """Overlap of some successive left images."""
-        # All over the sequence, as the pairs are whose rows are compared: a fault may lie in its second half.
+        # All over the sequence, because a fault may lie in its second half.
         chosen = spread(list(pairwise(self.frames)), 12)
         tasks = {(a, b): self.make.motion(a, b) for a, b in chosen if not {(a, "left"), (b, "left")} & self.broken}
         yield Maybe(list(tasks.values()))
@@ -221,12 +221,12 @@ class Inspection:
 
 
 def _cause(handle: Handle) -> RilleError:
-    """Why a task has no artifact.
+    """The error by which a task has no artifact.
 
     Raises
     ------
     Exception
-        What no stage should raise.
+        It is a fault of the program.
     """
     while handle.error is None:
         handle = next(upstream for upstream in handle.upstream() if not upstream.done)

@@ -35,7 +35,7 @@ def init(
     force
         Replace a manifest that is there.
     """
-    hindered = hindrance(directory.absolute())  # never a built-in sequence of the same name
+    hindered = hindrance(directory.absolute())  # absolute: not a built-in sequence of this name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
         manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
         print(f"{directory} opens as it is{manifest}")
@@ -49,7 +49,7 @@ def init(
     check_output(path, ".toml")
     if not force:
         check_new(path, remedy="give another --output, or overwrite it by --force")
-    # Written whether complete or not: what is missing stands in it as comments, at its place.
+    # Written even if incomplete, with comments in the place of missing keys.
     text = manifest_text(findings, _root(directory, path))
     atomic.write(path, text)
     needed = needs(text)
@@ -63,17 +63,17 @@ def init(
 
 
 def _root(directory: Path, path: Path) -> str:
-    """The folder as seen from the manifest: relative where the manifest lies in or beside it."""
+    """The folder as seen from the manifest: relative if the manifest lies in or beside it."""
     relative = os.path.relpath(directory.resolve(), path.resolve().parent)
-    # Two folders up and more, a relative path breaks as soon as either is moved.
+    # Two folders up or more a relative path breaks as soon as either is moved.
     far = relative.startswith(os.path.join("..", ".."))
     root = str(directory.resolve()) if far else Path(relative).as_posix()
-    writable(" ".join(root.splitlines()))  # of line breaks TOML has a form
+    writable(" ".join(root.splitlines()))  # TOML can hold line breaks
     return root
 
 
 def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
-    """Lines on what was found, what is needed, and what to type next."""
+    """Lines on findings, missing keys, and the next commands."""
     views, calibration = findings.views, findings.calibration
     size = f", {size_words(views.sizes)} pixels" if views.sizes else ""
     lines = [f"images       {pair_words(views)}{size}: {views.left} and {views.right}"]
@@ -89,7 +89,7 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
 
 
 def _next(path: Path, *, edit: bool = False) -> list[str]:
-    """What to type next, as a shell takes it."""
+    """The next commands, for a shell."""
     word = shlex.quote(str(path))
     steps = [*([f"edit {word}"] if edit else []), f"rille check {word}", f"rille reconstruct {word}"]
     return ["", "next:", *(f"  {step}" for step in steps)]

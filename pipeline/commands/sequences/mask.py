@@ -1,4 +1,4 @@
-"""``rille mask``: draw masks of what keeps its place in a sequence's images, such as the vehicle's own body."""
+"""``rille mask``: draw masks of still parts of a sequence's images, such as the vehicle's own body."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     if len(pairs) < MIN_IMAGES:
         text = f"{seq} has {count(len(pairs), 'pair')}, {MIN_IMAGES} are needed to see what keeps its place"
         raise InputError("RIL-906", text, remedy="draw the mask by hand")
-    # Twenty images: more would not change the mask.
+    # 20 images: more would not change the mask.
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, 20).round().astype(int))]
     written = []
     for camera, path in paths.items():

@@ -87,7 +87,7 @@ def match(
     check_output(output, ".tif", ".tiff", others=taken)
     if confidence is not None:
         check_output(confidence, ".tif", ".tiff", option="--confidence", others=taken | {output.resolve(): "--output"})
-    # Images are checked before the matcher is imported, which takes seconds.
+    # Images are checked before the import of the matcher, which takes seconds.
     stored = read_grey(left), read_grey(right)
     refuse_swapped(stored, f"{left} and {right}")
     images, spread = levelled(stored)
@@ -117,8 +117,8 @@ def match(
 
 @contextmanager
 def _progress(pixels: int) -> Iterator[Callable[[float, str], None]]:
-    """Callback that shows share and step of a large match as a bar, where stderr is a terminal."""
-    # Of a megapixel and more: below, matching takes less than seconds.
+    """Callback that shows share and step of a large match as a bar, if stderr is a terminal."""
+    # A megapixel or more: smaller images match in less than seconds.
     if pixels < 1_000_000 or not sys.stderr.isatty():
         yield lambda share, step: None
         return

@@ -1,1 +1,1 @@
-"""Forms of a run that other programs ask for: written by ``rille export --to``."""
+"""Exports of a run for other programs, written by ``rille export --to``."""

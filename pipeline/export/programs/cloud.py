@@ -29,7 +29,7 @@ ABOUT = {
     "ray_z": "direction from camera to point",
     "pair": "frame number of the stereo pair",
 }
-"""What the columns are that LAS does not know, in 32 letters at most."""
+"""Descriptions of the columns that LAS does not define, at most 32 characters each."""
 
 PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "uint"}
 
@@ -37,15 +37,15 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0) -> str:
-    """Write the points of a run as LAZ or PLY, by the ending of the file; what is in it.
+    """Write the points of a run as LAZ or PLY, by the ending of the file; return its content, in words.
 
-    Columns: x, y, z (m; of the place on Earth where the sequence has one), red, green, blue of the left image, the
-    standard deviations along and across the ray of the left camera (m), the ray's direction, and the pair's frame.
+    Columns: x, y, z (m; on Earth if the sequence has a place there), red, green, blue of the left image, the standard
+    deviations along and across the ray of the left camera (m), the ray's direction, and the pair's frame.
 
     Parameters
     ----------
-    every : each so many-th row and column alone.
-    voxel : one point in each cube of this side, m (0: all): that of the first pair, and of one pair's the most certain.
+    every : step of rows and columns.
+    voxel : side of cubes with one point each, m (0: all points): the most certain one of the first pair.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
     from rasterio.crs import CRS
 
     place, pairs = georeference_in(frames_of(run.run / "frames.json")), PlacedPairs(run, every)
-    # LAS 1.4 knows the first version of WKT alone.
+    # LAS 1.4 has WKT 1 alone.
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
     write = _write_laz if path.suffix.lower() == ".laz" else _write_ply
     parts = (_columns(run, one, place) for one in pairs)
@@ -64,7 +64,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
 
 
 def _thinned(parts: Iterator[Columns], voxel: float) -> Iterator[Columns]:
-    """The points of each pair that stay."""
+    """Points of each pair after thinning."""
     taken = np.zeros(0, np.int64)
     for columns in parts:
         cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]), voxel)
@@ -89,24 +89,24 @@ def _columns(run: RunArtifacts, one: PlacedPair, place: Georeference | None) -> 
 
 
 def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> int:
-    """Write LAS 1.4, point format 7, the CRS as WKT 1; the number of points."""
+    """Write LAS 1.4, point format 7, the CRS as WKT 1; return the number of points."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
-    # Of the first pair that has any, if one has.
+    # The first pair with points determines offsets and scales.
     first = next(parts)
     while not len(first["x"]) and (following := next(parts, None)) is not None:
         first = following
     header = laspy.LasHeader(point_format=7, version="1.4")
-    # Date that every LAZ file states, so that equal clouds make equal files
+    # A constant date, so that equal clouds make equal files.
     header.creation_date, header.generating_software, header.system_identifier = date(2000, 1, 1), "Rille", "stereo"
-    # LAS has coordinates of 32 bits: without offsets eastings would overflow at steps as fine as these.
+    # LAS has coordinates of 32 bits: without offsets eastings would overflow with such fine steps.
     if len(first["x"]):
         header.offsets = [float(np.floor(first[axis].min())) for axis in "xyz"]
-    # Ten steps of a coordinate in the median standard deviation across the ray of the first pair
+    # Step: a tenth of the median standard deviation across the ray of the first pair.
     step = float(np.median(first["sigma_across"])) / 10 if len(first["x"]) else 1e-3
     header.scales = np.full(3, 10.0 ** np.floor(np.log10(step)))
-    # With point formats 6 to 10 LAS 1.4 allows only WKT, and wants this bit set.
+    # With point formats 6 to 10 LAS 1.4 allows only WKT, and requires this bit.
     header.vlrs.append(WktCoordinateSystemVlr(crs))
     header.global_encoding.wkt = True
     for name, about in ABOUT.items():
@@ -118,14 +118,14 @@ def _write_laz(path: Path, parts: Iterator[Columns], crs: str) -> int:
                 # LAS has colours of 16 bits.
                 record[name] = values.astype(np.uint16) * np.uint16(257) if values.dtype == np.uint8 else values
             record["intensity"] = np.rint(np.column_stack([record[b] for b in ("red", "green", "blue")]) @ LUMA)
-            # LAS counts returns from 1: 0 of 0, which laspy leaves, is not valid.
+            # LAS counts returns from 1: 0 of 0, laspy's default, is invalid.
             record["return_number"][:] = record["number_of_returns"][:] = 1
             file.write_points(record)
         return int(file.header.point_count)
 
 
 def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> int:
-    """Write binary PLY; the number of points.
+    """Write binary PLY; return the number of points.
 
     Coordinates are 64-bit floats: eastings of 32 bits would jump by decimetres.
     """
@@ -136,11 +136,11 @@ def _write_ply(path: Path, parts: Iterator[Columns], crs: str) -> int:
             file.write(np.rec.fromarrays(list(part.values()), dtype=kinds).tobytes())
             count += len(part["x"])
             properties = [f"property {PLY_TYPES[values.dtype.name]} {name}" for name, values in part.items()]
-    # One line: a line feed would end the comment, and its rest would be read as a line of the header.
+    # In one line: a line feed would end the comment.
     lines = ["ply", "format binary_little_endian 1.0", f"comment crs {' '.join(crs.split())}"]
     lines += [f"comment {name}: {about}" for name, about in ABOUT.items()]
     lines += [f"element vertex {count}", *properties, "end_header"]
-    # How many points there are is known at the end.
+    # Header last, since the number of points is known at the end.
     with path.open("wb") as file, body.open("rb") as points:
         file.write("".join(f"{line}\n" for line in lines).encode())
         shutil.copyfileobj(points, file)

@@ -1,8 +1,8 @@
 """A finished run as a COLMAP model: cameras, their rig, poses, and the tracked points with their coordinates.
 
-COLMAP puts the centre of the first pixel at (0.5, 0.5) and stores world-to-camera poses. The rig is the one that was
-computed with; it has number 1, its cameras 1 (left, its origin) and 2. Images are those of an ideal camera, so where a
-lens was undone the files on disk are not the model's.
+COLMAP puts the centre of the first pixel at (0.5, 0.5) and stores world-to-camera poses. The rig is that of the
+computation; it has number 1, its cameras 1 (left, its origin) and 2. Images are those of an ideal camera: if distortion
+was removed, the image files on disk do not fit the model.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import colours
 
 MAX_REPROJECTION_PX = 0.5
-"""Pixels from an observation to its point's projection. COLMAP weighs all observations alike, so that one which our
-resection hardly counted would pull an adjustment away: on a street of 60 m by 0.45 m, with the limit by 0.10 m."""
+"""Pixels: largest distance of an observation from its point's projection. COLMAP weights all observations equally, so
+that those of little weight in our resection would distort an adjustment: on a street of 60 m by 0.45 m, with the limit
+by 0.10 m."""
 
 Seen = dict[tuple[int, str], list[Floats]]
-"""Pixels (column, row) by COLMAP's centre that show a point, of each image, named by its frame and side."""
+"""Observations (column, row) in COLMAP's pixel coordinates by image, i.e. frame and side."""
 
 
 class MatchedSegment(NamedTuple):
-    """Tracks from one key frame to the next, their resection, and by frame number the disparities of its pairs."""
+    """Tracks from one key frame to the next, their resection, and the disparities of its pairs by frame number."""
 
     track: Bundle
     resection: Bundle
@@ -44,13 +45,13 @@ class MatchedSegment(NamedTuple):
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
-    """Write the model of a run as COLMAP's text files into a new folder; what was written, in words."""
+    """Write the model of a run as COLMAP's text files into a new folder; return its content, in words."""
     rig = Rig.from_dict(run.one("calibration").meta["rig"])
     segments = _segments(run)
     keys = [_ends(segment.track)[0] for segment in segments]
     images = {key: run.left_image(key) for key in keys}
     names = {int(row["frame"]): str(row["name"]) for row in frames_of(run.run / "frames.json").get("frames", [])}
-    # A drive has a trajectory at each stop: the last one is all of it.
+    # A drive has a trajectory at each stop: the last one is complete.
     model = build(rig, run.one("trajectory", last=True), names, segments, images)
     folder.mkdir()
     model.write_text(str(folder))
@@ -61,8 +62,8 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
 
 
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
-    """The segments of a run in their order."""
-    # A leg of a drive that was stopped is tracked once more, up to there: the later one counts.
+    """Segments of a run, in order."""
+    # A leg that was stopped is tracked once more, up to the stop: the later one counts.
     tracks, resections = bundles.all("track"), bundles.all("resect")
     of_key = {_ends(track)[0]: (track, resections[part]) for part, track in tracks.items() if part in resections}
     segments = []
@@ -81,8 +82,8 @@ def build(
 ) -> Any:
     """A ``pycolmap.Reconstruction``.
 
-    A point is seen in the left images in which it agreed with the pose, and in the right image of each pair that was
-    matched: without these an adjustment of the model could change its scale.
+    A point is observed in the left images where it agreed with the pose, and in the right image of each matched pair,
+    without which an adjustment of the model could change its scale.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def build(
         for f, pose in zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
         if np.isfinite(pose).all()
     }
-    # Before images are made: each point adds its pixels to the images that see it.
+    # Before images are made, since each point adds observations to them.
     seen: Seen = {(frame, side): [] for frame in poses for side in CAMERAS}
     points = [point for segment in segments for point in _points(segment, rig, poses, seen, images or {})]
     number = {image: k for k, image in enumerate(seen, start=1)}
@@ -134,7 +135,7 @@ def build(
 
 
 def _ends(track: Bundle) -> list[int]:
-    """First and last frame of a segment: the key frames, whose pairs are matched."""
+    """First and last frame of a segment: its key frames."""
     frames = track.meta["frames"]
     return [int(frames[0]), int(frames[-1])]
 
@@ -142,7 +143,7 @@ def _ends(track: Bundle) -> list[int]:
 def _points(
     segment: MatchedSegment, rig: Rig, poses: Mapping[int, RigidTransform], seen: Seen, images: Mapping[int, Bundle]
 ) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], Bytes]]:
-    """Points of a segment in the world, by which pixel of which images each is seen, and its colour (or black).
+    """Points of a segment in the world, each with its observations (image, index of its pixel) and colour (or black).
 
     The pixels are added to ``seen``.
     """
@@ -168,7 +169,7 @@ def _points(
     last = rig.left.width - 1, rig.left.height - 1
     first = np.clip(np.nan_to_num(pixels[:, 0, 0]).astype(int), 0, last)
     rgb = colours(first, images[key]) if key in images else np.zeros((len(first), 3), np.uint8)
-    # A point seen once would slide along its ray in any adjustment of the model.
+    # Points with one observation are not determined.
     for k in np.flatnonzero(np.isfinite(world).all(1) & (shown.sum(axis=(1, 2)) > 1)):
         elements = []
         for j, side in np.argwhere(shown[k]):
@@ -179,5 +180,5 @@ def _points(
 
 
 def _near(camera: Camera, points: Floats, pixels: Floats) -> NDArray[np.bool_]:
-    """Whether points (n, 3) of the camera frame, metres, project near to pixels (n, 2)."""
+    """Which points (n, 3) of the camera frame, metres, project to within the limit of pixels (n, 2)."""
     return np.asarray(np.hypot(*(camera.project(points) - pixels).T) <= MAX_REPROJECTION_PX)

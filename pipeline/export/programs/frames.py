@@ -1,8 +1,7 @@
-"""What each stereo pair tells of its left image's pixels, as rasters in the geometry of that image (GeoTIFF, float32).
+"""Rasters of each stereo pair in the geometry of its left image (GeoTIFF, float32).
 
-Names as rover teams have them (VICAR): XYZ, RNG and RNE (range and its error), UVW (surface normal), SLP (slope), RUF
-(roughness), DSP (disparity). Positions and normals are in the world frame; the camera that a raster belongs to stands
-in its metadata.
+Names as used by rover teams (VICAR): XYZ, RNG and RNE (range and its error), UVW (surface normal), SLP (slope), RUF
+(roughness), DSP (disparity). Positions and normals are in the world frame; metadata of a raster describe its camera.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ Bands = Mapping[str, Floats32]
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
-    """Write the rasters of every pair into a new folder; what was written, in words."""
+    """Write the rasters of every pair into a new folder; return its content, in words."""
     pairs = PlacedPairs(run)
     folder.mkdir()
     for one in pairs:

@@ -19,14 +19,14 @@ from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
-    """Write the map of a run into a new folder; what was written, in words."""
+    """Write the map of a run into a new folder; return its content, in words."""
     risk = run.risk()
     lattice, classes = Lattice.from_dict(risk.meta["lattice"]), np.asarray(risk["risk"])
     percent = np.rint(100.0 * np.nan_to_num(np.clip(risk["p_hazard"], 0.0, 1.0)))
     cells = np.select([classes == HAZARDOUS, classes == UNKNOWN], [100, 255], percent)
     left, _, bottom, _ = (round(v, 9) for v in lattice.bounds)
     about = {"image": "map.pgm", "mode": "raw", "resolution": lattice.cell, "origin": [left, bottom, 0.0], "negate": 0}
-    # map_server demands both thresholds in every mode, also in raw, which has no use for them.
+    # map_server demands both thresholds in every mode, although raw does not use them.
     about |= {"occupied_thresh": 1.0, "free_thresh": 0.0}
     folder.mkdir()
     (folder / "map.pgm").write_bytes(cv2.imencode(".pgm", cells.astype(np.uint8))[1].tobytes())

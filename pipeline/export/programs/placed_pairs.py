@@ -27,8 +27,8 @@ class PlacedPair:
 
 
 class PlacedPairs:
-    """All of a run; iterated, one is opened at a time. ``words``: how many there are, and how many have no pose;
-    ``vertical``: source of the world's vertical.
+    """Iterable of all placed pairs of a run, opened one at a time. ``words``: number of these, and of pairs without a
+    pose; ``vertical``: source of the world's vertical.
 
     Raises
     ------
@@ -37,7 +37,7 @@ class PlacedPairs:
     """
 
     def __init__(self, run: RunArtifacts, every: int = 1) -> None:
-        """``every``: points of each so many-th row and column of the images alone."""
+        """``every``: step of rows and columns of the images."""
         trajectory = run.one("trajectory", last=True)
         frames, pieces = trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist()
         self._poses = dict(zip(frames, np.asarray(trajectory["poses"]), strict=True))

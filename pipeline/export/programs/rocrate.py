@@ -1,7 +1,7 @@
-"""A run as an RO-Crate 1.1: its files, what they were made of and with, and the command, for archives and reruns.
+"""A run as an RO-Crate 1.1: its files, inputs, programs and command, for archives and reruns.
 
 https://www.researchobject.org/ro-crate/specification/1.1. The crate holds copies of the run's files, each with its
-SHA-256. The run is an action, whose objects are the parameters and the digests of all files that were read, and whose
+SHA-256. The run is an action, whose objects are the parameters and the digests of all files that it read, and whose
 instruments are Rille and the packages that results depend on. `rille reconstruct CRATE` runs it again and compares.
 """
 
@@ -32,11 +32,11 @@ Entity = dict[str, Any]
 
 
 def write_run(folder: Path, run: RunArtifacts) -> str:
-    """Write the run's files and ``ro-crate-metadata.json``; gives what there is, in words."""
+    """Write the run's files and ``ro-crate-metadata.json``; return the content, in words."""
     folder.mkdir()
     files = []
     for name, what, _ in catalogue.listed(run.run):
-        if what and (run.run / name).exists():  # files without an explanation are exports, not files of the run
+        if what and (run.run / name).exists():  # files without a description are exports, not files of the run
             refuse_irregular(run.run / name)
             copy = shutil.copytree if (run.run / name).is_dir() else shutil.copy2
             copy(run.run / name, folder / name)
@@ -100,19 +100,19 @@ def _about(run: Path, facts: Mapping[str, Any], files: list[Entity], inputs: lis
 
 
 def _programs(versions: Mapping[str, str]) -> Iterator[Entity]:
-    """Rille, and what its results depend on."""
+    """Rille, and the packages that its results depend on."""
     needed = {"softwareRequirements": _links(f"#{name}" for name in versions if name != "rille")}
     for name, version in versions.items():
         more = needed if name == "rille" else {}
         yield _entity(f"#{name}", "SoftwareApplication", name, version=version, **more)
 
 
-# -- a crate that is run again ------------------------------------------------------------------------------------
+# -- rerun of a crate ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Crate:
-    """A run out of a crate: its sequence, the options of its command by name, and the SHA-256 of each result."""
+    """A run described by a crate: its sequence, the options of its command by name, and the SHA-256 of each result."""
 
     folder: Path
     sequence: str
@@ -120,7 +120,7 @@ class Crate:
     digests: Mapping[str, str]
 
     def unlike(self, run: Path) -> list[str]:
-        """Results of the crate that a run lacks, or has otherwise."""
+        """Results of the crate that differ in a run, or are missing there."""
         return [name for name, digest in self.digests.items() if _sha256(run / name) != digest]
 
 
@@ -129,7 +129,7 @@ def _sha256(path: Path) -> str:
 
 
 def read(folder: Path) -> Crate | None:
-    """Return the run that a crate describes; None: the folder is no crate, or one of data alone.
+    """The run that a crate describes; None: the folder is no crate, or one of data alone.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A run for other programs: its artifacts by their labels, and the writing of a folder of one form."""
+"""Artifacts of a run by their labels, and the export of a run in one form."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 
 FILES = {"laz": "cloud.laz", "ply": "cloud.ply", "glb": "terrain.glb"}
-"""Forms that are one file, and its usual name; any other is a folder of its own name. The module of that name, without
-ending, writes it."""
+"""Forms that are one file, and its usual name; any other is a folder named by its form. The module of that name,
+without ending, writes it."""
 
 
 def export_run(form: str, run: Path, target: Path, store: Store, **thinning: float) -> str:
-    """Write a run folder in a form, such as ``laz`` or ``colmap``, whole or not at all; what was written, in words.
+    """Export a run folder in a form, such as ``laz`` or ``colmap``, whole or not at all; return its content, in words.
 
     Parameters
     ----------
-    thinning : of points, as :func:`rille.pipeline.export.programs.cloud.write_run` takes it.
+    thinning : of points, see :func:`rille.pipeline.export.programs.cloud.write_run`.
 
     Raises
     ------
     InputError
-        The run has nothing that the form shows, or its artifacts are gone from the cache.
+        The run has nothing for this form, or its artifacts are gone from the cache.
     ConfigError
         ``target`` is a folder that is not empty.
     """
@@ -45,9 +45,9 @@ def export_run(form: str, run: Path, target: Path, store: Store, **thinning: flo
 
 
 class RunArtifacts:
-    """The artifacts that the ledger of a run refers to; opened, they read their arrays when these are asked for.
+    """The artifacts in the ledger of a run; arrays are read at access.
 
-    Where the run has corrected its calibration a label stands for the task that was laid out last.
+    If the run has corrected its calibration, a label stands for the task that was laid out last.
     """
 
     def __init__(self, run: Path, store: Store) -> None:
@@ -61,12 +61,12 @@ class RunArtifacts:
         return {first_label(row["label"]): row for row in made if row["label"] not in outdated}
 
     def find(self, label: str) -> Bundle | None:
-        """The artifact of exactly this label, if the run has it."""
+        """The artifact of exactly this label; None if the run has none."""
         return self._open(label) if label in self._rows else None
 
     def one(self, label: str, *, last: bool = False) -> Bundle:
         """The artifact of this label, else the first (or last) whose label begins with it."""
-        # With the slash, "merge" does not find a stage whose name merely begins so.
+        # With the slash, so that "merge" does not match other stages whose names begin with it.
         begun = [name for name in self._rows if f"{name}/".startswith(f"{label}/")]
         if not begun:
             text = f"the run has no {label}"
@@ -80,7 +80,7 @@ class RunArtifacts:
         return {name.partition("/")[2]: self._open(name) for name in names}
 
     def labels(self, pattern: str) -> list[str]:
-        """The group of a pattern in each label that matches it as a whole."""
+        """The first group of a pattern in each label that it matches as a whole."""
         return [match[1] for name in self._rows if (match := re.fullmatch(pattern, name))]
 
     def input(self, label: str, port: str) -> Bundle:
@@ -99,7 +99,7 @@ class RunArtifacts:
         return self.one(f"risk/{max(stops)}" if stops and "risk/world" not in self._rows else "risk/world")
 
     def digests(self) -> Iterator[tuple[str, str]]:
-        """Label and SHA-256 of each file that a task of the run has read, as its artifact states it."""
+        """Label and SHA-256 of each file that a task of the run has read, by its artifact."""
         for label, row in self._rows.items():
             made = self._store.manifest(str(row["stage"]), str(row["key"])) if not row.get("inputs") else None
             args = {} if made is None else made["provenance"]["args"]

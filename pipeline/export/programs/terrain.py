@@ -13,13 +13,13 @@ from rille.pipeline.export.read_dem import DemFile, opened_raster, read_elevatio
 from rille.stages.core.errors import InputError
 
 MAX_FACES = 2_000_000
-"""Most triangles of a mesh: more make browsers and phones fail; a coarser one is made beyond, and said to be."""
+"""Most triangles of a mesh, since browsers and phones fail with more; a larger mesh is made coarser."""
 Layer = NDArray[np.float64] | None
-"""Values of the cells of a terrain, (rows, cols) or of colours (rows, cols, 3), where the run has them."""
+"""Values of the cells of a terrain, (rows, cols), or colours (rows, cols, 3); None: there are none."""
 
 
 def write_run(path: Path, run: RunArtifacts) -> str:
-    """Write the terrain of a run as a mesh; what is in the file.
+    """Write the terrain of a run as a mesh; return the content, in words.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def write_run(path: Path, run: RunArtifacts) -> str:
 
 
 def _ortho(run: Path, terrain: DemFile) -> Layer:
-    """The ortho image of the run, (rows, cols) or of colours (rows, cols, 3); None: there is none."""
+    """The ortho image of the run, (rows, cols) or in colours (rows, cols, 3); None: there is none."""
     path = run / "ortho.tif"
     if not path.is_file():
         return None
@@ -46,8 +46,8 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     """Write the triangles between known neighbouring cells, with the ortho image as texture.
 
     glTF's axes are x right, y up, z towards the viewer: x = x, y = z, z = -y of the terrain's frame. Coordinates are
-    metres from the middle of the terrain, which the scene's ``extras`` name: as 32-bit floats, eastings would jump by
-    decimetres. Above :data:`MAX_FACES` triangles every second, third ... cell is left out.
+    metres from the middle of the terrain (in the scene's ``extras``), since eastings as 32-bit floats would be wrong by
+    decimetres. A mesh of more than :data:`MAX_FACES` triangles takes every second, third ... cell alone.
     """
     import trimesh
 
@@ -63,7 +63,7 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
     shown = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]]).astype(np.float32)
     look = _texture(ortho)
     visual = trimesh.visual.TextureVisuals(uv=uv, material=look) if look is not None else None
-    # process would merge vertices and number them anew, away from their texture coordinates.
+    # process would merge and renumber vertices, but not their texture coordinates.
     mesh = trimesh.Trimesh(vertices=shown, faces=faces, visual=visual, process=False)
     scene = trimesh.Scene({"terrain": mesh})
     scene.metadata["origin_m"] = middle.tolist()
@@ -75,12 +75,12 @@ def write_glb(path: Path, terrain: DemFile, ortho: Layer) -> str:
 
 
 def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Vertices (n, 3) in the CRS, triangles (m, 3) seen from above anticlockwise, texture coordinates (n, 2)."""
+    """Vertices (n, 3) in the CRS, triangles (m, 3), anticlockwise from above, and texture coordinates (n, 2)."""
     z = terrain.grid.values[::step, ::step]
     number = np.arange(z.size).reshape(z.shape)
     quads = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]], axis=-1).reshape(-1, 4)
     a, b, c, d = quads[np.isfinite(z.ravel()[quads]).all(axis=1)].T
-    # glTF takes the side from which corners run anticlockwise for the front.
+    # In glTF the front is the side from which corners run anticlockwise.
     used, faces = np.unique(
         np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])]), return_inverse=True
     )
@@ -88,7 +88,7 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
     col, row = col * step, row * step
     x, y = terrain.grid.matrix @ [col, row, np.ones(len(used))]
     rows, cols = terrain.grid.values.shape
-    # trimesh has v = 0 at the foot of the texture, and turns it when it writes glTF.
+    # trimesh has v = 0 at the bottom of the texture, and flips it for glTF.
     return (
         np.column_stack([x, y, terrain.grid.values[row, col]]),
         faces.reshape(-1, 3),
@@ -97,16 +97,16 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _texture(ortho: Layer) -> Any:
-    """Material in the colours of an ortho image, grey where it has no value."""
+    """Material in the colours of an ortho image, grey for unknown cells."""
     if ortho is None:
         return None
     from PIL import Image
     from trimesh.visual.material import PBRMaterial
 
     bands = ortho if ortho.ndim == 3 else np.repeat(ortho[..., None], 3, axis=2)
-    # Cells without ortho image are of a neutral grey: black would look like a shadow.
+    # Unknown cells are grey: black would look like a shadow.
     image = Image.fromarray(np.rint(np.clip(np.nan_to_num(bands, nan=128), 0, 255)).astype(np.uint8))
-    # The greatest texture that every WebGL implementation takes; a smaller one stays as it is.
+    # 4096: largest texture that every WebGL implementation takes.
     image.thumbnail((4096, 4096))
-    # glTF's material is a metal unless told otherwise, and would mirror instead of showing the texture.
+    # glTF's default material is a metal, which would mirror instead of showing the texture.
     return PBRMaterial(name="ortho", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)

@@ -1,1 +1,1 @@
-"""How given truth is to be read: conventions of its poses, its clock, and where its body sits."""
+"""How to read given truth: conventions of its poses, offset of its clock, mounting of its body."""

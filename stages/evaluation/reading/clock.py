@@ -1,12 +1,12 @@
 """Constant offset of the truth's clock against that of the images.
 
-It is the offset at which the estimated positions lie nearest to those of the truth after a rigid motion, against the
-extent of both tracks.
+At this offset the distance of estimated and true positions after a rigid motion, over the extent of both tracks, is
+least.
 
-An offset can only be found where speed or direction change: on a straight line at constant speed it is a shift of
-place. Stated with it is how far it may be moved until the squared error doubles: up to there it adds less than remains,
-and what remains (drift, scale) may have moved the best offset as far. Where this range does not end within what was
-searched, or takes half of it, the offset is not determined, and that of the stated clocks, 0, is kept if it lies in it.
+Changes of speed or direction determine the offset: on a straight line at constant speed it is the same as a shift in
+space. Its range extends to where the squared error doubles, because remaining errors (drift, scale) may have moved the
+best offset as far. If this range does not end within the searched one, or takes half of it, the offset is not
+determined, and 0 (the clocks as stated) is kept if it lies in the range.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.rigid import fit_rigid
 
 MIN_FRAMES = 4
-"""Fewest frames with pose and truth: more than the unknowns (turn, shift, clock offset) take up."""
+"""Fewest frames with pose and truth: more than the unknowns (turn, shift, clock offset) need."""
 
 MIN_SHARE = 2 / 3
-"""Smallest number of compared frames, as a share of the most that any offset compares: few frames fit anywhere."""
+"""Fewest compared frames over the most that any offset compares, since few frames fit anywhere."""
 
 EQUAL_ERROR = 2**0.5
-"""Factor on the least error up to which offsets count as equally good: they add less to it than what remains."""
+"""Factor on the least error up to which offsets count as equally good: its square doubles."""
 
 MAX_TRIALS = 20000
 """Most offsets that are tried before the best one is refined."""
@@ -36,7 +36,7 @@ MAX_TRIALS = 20000
 
 @dataclass(frozen=True)
 class TruePositions:
-    """``positions`` (row, 2 or 3), m, x and y in the plane and z up; ``times`` (row,), s; rows are frames without.
+    """``positions`` (row, 2 or 3), m, x and y in the plane and z up; ``times`` (row,), s; without them rows are frames.
 
     Nothing is interpolated between rows that are more than ``max_gap`` s apart. ``lever_arm`` (3,), m, is the place of
     the antenna or prism in the left camera's frame (x right, y down, z ahead); None: not known.
@@ -59,18 +59,18 @@ class TruePositions:
         after = np.searchsorted(self.times, moments).clip(0, len(self.times) - 1)
         start, end = self.times[(after - 1).clip(0)], self.times[after]
         known = (start <= moments) & (moments <= end) & (end - start <= self.max_gap)
-        # At a row itself a gap beside it does not matter; and times are written with few digits: the first and the last
-        # image must not fall out by a rounding.
+        # At a row itself a gap beside it does not matter; and times have few digits: rounding must not exclude the
+        # first and the last image.
         known |= np.minimum(np.abs(moments - start), np.abs(moments - end)) <= 1e-6
         places = np.stack([np.interp(moments, self.times, axis) for axis in self.positions.T], axis=1)
         return np.where(known[:, None], places, np.nan)
 
 
 class Offset(NamedTuple):
-    """Seconds to add to the times of the truth; ``low`` and ``high``: until there the squared error at most doubles, to
-    half the time between frames.
+    """Seconds to add to the times of the truth; from ``low`` to ``high`` the squared error at most doubles, to half the
+    time between frames.
 
-    ``determined``: both ends lie within what was searched, and close enough together.
+    ``determined``: both ends lie within the searched range, and close enough together.
     """
 
     value: float
@@ -89,7 +89,7 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
 
     Returns
     -------
-    None where no offset makes :data:`MIN_FRAMES` frames comparable.
+    None if no offset makes :data:`MIN_FRAMES` frames comparable.
     """
     tried = _candidates(moments, truth)
     posed = np.isfinite(estimate).all(axis=1)
@@ -107,47 +107,47 @@ def find_offset(moments: Floats, estimate: Floats, truth: TruePositions, upright
         return None
     value, step = float(tried[np.argmin(errors)]), float(tried[1] - tried[0])
     span, options = (value - step, value + step), {"xatol": 1e-5}
-    # The search takes differences, which infinity has none of.
+    # The search takes differences, which infinity does not have.
     near = scipy.optimize.minimize_scalar(lambda x: min(error(x), 1e3), bounds=span, method="bounded", options=options)
     value = value if errors.min() <= near.fun else float(near.x)
     equal = np.append(tried[errors <= EQUAL_ERROR * error(value)], value)
-    # The nearest worse offsets beyond all that are as good: where straight lines join the rows of the truth, offsets
-    # between its rows fit worse than those of whole rows. Too few frames compared are no end.
+    # The nearest offsets beyond all equally good ones: on the straight lines between rows of the truth, offsets fit
+    # worse than at the rows. An offset that compares too few frames is no end.
     beyond = np.searchsorted(tried, equal.min()) - 1, np.searchsorted(tried, equal.max(), side="right")
     ends = np.clip(beyond, 0, len(tried) - 1)
     ended = [bool(EQUAL_ERROR * error(value) < errors[k] < np.inf) for k in ends]
     low, high = (float(tried[k]) for k in ends)
-    # 0.5: share of the searched range: where equally good offsets span more, the offset is not determined.
+    # 0.5: share of the searched range; if equally good offsets span more, the offset is not determined.
     determined = all(ended) and high - low < 0.5 * np.ptp(tried[np.isfinite(errors)])
     return Offset(0.0 if not determined and low <= 0.0 <= high else value, low, high, bool(determined))
 
 
 def _candidates(moments: Floats, truth: TruePositions) -> Floats:
-    """Offsets (n,) to try, s, half a frame apart: near 0 where the clocks have a time in common, else all."""
+    """Offsets (n,) to try, s, half a frame apart: near 0 if the clocks have a time in common, else all."""
     assert truth.times is not None
     low, high = float(moments[0] - truth.times[-1]), float(moments[-1] - truth.times[0])
     step = 0.5 * float(np.median(np.diff(moments))) if len(moments) > 1 else 0.1
     if low < 0.0 < high:
-        # 10.0: largest clock offset that is searched where the clocks have a time in common: a longer search finds
-        # other stretches of the track that look alike.
+        # 10.0: largest clock offset, s, that is tried if the clocks have a time in common: larger ones may fit other
+        # stretches of the track that look alike.
         low, high = max(low, -10.0), min(high, 10.0)
-        # Of images a minute apart half a frame is more than all that is searched.
+        # Half the time between images that are a minute apart is more than the searched range.
         step = min(max(step, (high - low) / MAX_TRIALS), 0.5 * (high - low))
         return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
     return np.linspace(low, high, int(np.clip((high - low) / step, 2, MAX_TRIALS)) + 1)
 
 
 class LateTruth(NamedTuple):
-    """Seconds to add to the times of true poses, and RMS error of the positions that is left then, m."""
+    """Seconds to add to the times of true poses, and RMS error of the positions with them, m."""
 
     offset: float
     error: float
 
 
 def late_truth(moments: Floats, estimate: Floats, truth: TruePositions) -> LateTruth | None:
-    """By how much the clock of true poses is off; None where the tracks do not say that it is (:func:`find_offset`)."""
+    """Clock offset of true poses; None if the tracks do not determine one (:func:`find_offset`)."""
     offset = find_offset(moments, estimate, truth, upright=False)
-    # 0 is among the offsets that are tried: where it is worse by itself, it may be an end of those that are as good.
+    # Not "<=": an offset of 0, which is tried too, may be the end of the range although it is worse.
     if offset is None or not offset.determined or offset.low < 0.0 < offset.high:
         return None
     return LateTruth(offset.value, fit_rigid(estimate, truth.at(moments - offset.value), upright=False).error)

@@ -1,10 +1,10 @@
 """Whether truth would fit the trajectory if its file were read by another convention; no estimate is changed by this.
 
-A pose of the file becomes another one by each reading (order of the quaternion, direction of the transform, a mirrored
-axis), in reverse order, by a unit of length, and by other axes of the body: a rotation B from the right, one of the 24
-that exchange axes or the one that fits best. Readings are compared by what the best rotation and translation of the
-world leaves of positions and orientations together (:mod:`rille.stages.geometry.rigid`), over the extent of the
-trajectory. A drive that is straight or hardly turns is fitted by several readings alike: they are named together.
+Readings differ in the order of the quaternion, the direction of the transform, a mirrored axis, the order of the poses,
+the unit of length, and the axes of the body: a rotation B from the right, one of the 24 that exchange axes or the one
+that fits best. Readings are compared by the misfit of positions and orientations together after the best rotation and
+translation of the world (:mod:`rille.stages.geometry.rigid`), over the extent of the trajectory. A drive that is
+straight or hardly turns is fitted by several readings alike, which are named together.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms,
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
 # Share of the extent of a trajectory below which its truth is at rest.
-# Misfit over the extent, as read, up to which the estimate's own errors explain it; and the share of it that another
-# reading leaves at most, and of the extent; and from where on no estimate errs so.
+# Misfit over the extent, as read, up to which the estimate's own errors explain it; largest share of it, and of the
+# extent, that another reading may leave; and the misfit above which no estimate errs as much.
 MIN_MISFIT, MAX_SHARE, MAX_MISFIT, MUCH = 0.02, 0.4, 0.1, 0.3
-# Factor on the least misfit, and share of the extent beyond, up to which readings cannot be told apart; and the factor
-# up to which an estimate's own errors may favour one that changes more.
+# Factor on the least misfit, and share of the extent added to it, up to which readings cannot be told apart; and the
+# factor by which an estimate's own errors may favour a reading of more changes.
 ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 # Least turn of a body against the camera, radians: an estimate's own errors look like smaller ones.
 MIN_TURN = 0.3
-# Factor of length from which on it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
+# Factor of length above which it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
 MIN_UNIT, UNITS = 1.3, (0.001, 0.01, 0.0254, 0.3048, 0.9144, 1000.0)
 # Places, in (x, y, z, w) as read, of the true x, y, z and w.
 ORDERS = {
@@ -53,7 +53,7 @@ MIRRORS = {
 
 
 class ReadingFit(NamedTuple):
-    """Misfit of a reading over the extent; its number of changes; what to do."""
+    """Misfit of a reading over the extent; its number of changes; remedy."""
 
     misfit: float
     changes: int
@@ -63,7 +63,7 @@ class ReadingFit(NamedTuple):
 def better_reading(
     estimate: Floats, truth: Floats, T_body_left: RigidTransform, sigma: float, mounted: Floats | None = None
 ) -> list[str]:
-    """Warn of conventions by which the truth fits far better than as it was read, and say what to do about the file.
+    """Warnings that the truth fits far better by other conventions than as it was read, with the remedy.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def better_reading(
     truth : (frame, 3, 4) T_truth_left as read.
     T_body_left : by which the file's poses were multiplied.
     sigma : m, of the estimated positions.
-    mounted : (frame, 3, 4) truth of a body that is mounted otherwise (:mod:`.hand_eye`), which needs no word here.
+    mounted : (frame, 3, 4) truth with the mounting corrected (:mod:`.hand_eye`), for which no warning is due here.
     """
     chosen = np.linspace(0, len(estimate) - 1, min(len(estimate), MAX_FRAMES)).astype(int)
     P, Q, mount = estimate[chosen], truth[chosen], T_body_left.matrix34
@@ -109,7 +109,7 @@ def better_reading(
         )
         doubt = "conventions: is it of this drive, and are its columns, and the order of the images, right?"
         return [f"{text} {doubt}"] if as_read > MUCH else []
-    # The simplest of those that fit: others may fit better by the estimate's own errors.
+    # The simplest of those that fit: others may fit better only because of the estimate's errors.
     most = min(MAX_SHARE * as_read, SIMPLE_FACTOR * best + ALIKE_SHARE)
     changes = min(fit.changes for fit in fits if fit.misfit <= most)
     simple = sorted(fit for fit in fits if fit.changes == changes)
@@ -125,8 +125,8 @@ def better_reading(
 
 
 def _jumps(P: Floats, Q: Floats, sigma: float) -> list[str]:
-    """Warn of few motions of the truth Q (n, 3, 4) that depart from those of P far more than the others do, and without
-    which it fits; ``sigma``, m, of a position of P."""
+    """Warning if the truth Q (n, 3, 4) fits P but for a few motions, which depart far more than the others; ``sigma``,
+    m, of a position of P."""
     moved, said = (compose(inverse(T[:-1]), T[1:]) for T in (P, Q))
     off = np.linalg.norm(moved[:, :, 3] - said[:, :, 3], axis=1)
     jumps = np.flatnonzero(standing_out(off, 3.0 * sigma))
@@ -143,7 +143,7 @@ def _jumps(P: Floats, Q: Floats, sigma: float) -> list[str]:
 
 
 def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[ReadingFit]:
-    """Unit and axes of the body by which a reading Q (n, 3, 4) of the truth fits."""
+    """Fits of a reading Q (n, 3, 4) of the truth with the best unit and several axes of the body."""
     ratio, fits = spread(P) / max(spread(Q), 1e-12), []
     if not 1.0 / MIN_UNIT < ratio < MIN_UNIT:
         unit = next((unit for unit in UNITS if abs(np.log(unit / ratio)) < 0.1), float(f"{ratio:.3g}"))
@@ -156,16 +156,16 @@ def _fits(P: Floats, Q: Floats, mount: Floats, words: list[str]) -> list[Reading
     for start in (exchanges[0], min(exchanges, key=lambda B: _misfit(P, Q @ _turn(B)))):
         turn = start
         for _ in range(10):
-            # In turn: the world's rotation for this body, by the positions above all, and the body's for this world.
+            # In turn: the world's rotation for this body, mostly by positions, and the body's rotation for this world.
             R_world_truth = alignment(Q @ _turn(turn), P, 0.1)[:, :3]
             turn = orthonormal(np.einsum("nji,kj,nkl->il", Q[:, :, :3], R_world_truth, P[:, :, :3]))
-        # An estimate that errs by some degrees fits a little better if turned by them: that is no other convention.
+        # Smaller turns are due to errors of the estimate, not to another convention.
         axes = start if angle(start.T @ turn) < MIN_TURN else turn
         said, other = words, bool(angle(axes) > MIN_TURN)
         if other:
             body = np.column_stack([mount[:, :3] @ axes, mount[:, 3]]).round(4) + 0.0
             said = [*words, f"its poses are those of a body with other axes: state truth.T_body_left = {body.tolist()}"]
-        # Simple ones first: conventions of the file and axes that are exchanged, then axes that are turned.
+        # Turned axes count as one change more than exchanged ones.
         changes = len(said) + (axes is turn)
         fits.append(ReadingFit(_misfit(P, Q @ _turn(axes)), changes, " and ".join(said)))
     return fits
@@ -179,5 +179,5 @@ def _turn(axes: Floats) -> Floats:
 def _misfit(P: Floats, Q: Floats) -> float:
     """RMS misfit of poses Q (n, 3, 4) after the best alignment with P, over P's extent."""
     off = compose(alignment(Q, P, 1.0), Q) - P
-    # A rotation counts by its angle: beside the extent, a lever as long.
+    # An angle of one radian counts like a position error of the extent.
     return float(np.hypot(rms(off[:, :, 3]) / spread(P), rms(off[:, :, :3].reshape(len(P), 9)) / np.sqrt(2.0)))

@@ -1,13 +1,13 @@
-"""A constant turn and shift of the truth's body against the camera that its mounting does not say (hand-eye).
+"""Hand-eye calibration: constant error of the stated transform between the truth's body and the camera.
 
 True poses are those of a body: markers, an IMU, two antennas. ``truth.T_body_left`` says where the camera is in it. If
 that is off by a constant transform X, every true pose of the camera is off by X from the right, and every motion from
-frame to frame becomes ``X^-1 M X``: a camera that turns seems to err in each of its steps, however exact it is. X is
-found by all frames together (Shiu, Ahmad 1989, doi:10.1109/70.88014): the shift as a lever arm, as far as turns show
-it, and the turn by the motions from frame to frame.
+frame to frame becomes ``X^-1 M X``: a camera that turns seems to err in each step, however exact its estimate. X is
+estimated from all frames together (Shiu, Ahmad 1989, doi:10.1109/70.88014): the shift as a lever arm, as far as turns
+determine it, and the turn by the motions from frame to frame.
 
-Figures with X left out stand beside those by the truth as given. Where truth is positions alone, the shift is all that
-there is of X (:mod:`rille.stages.evaluation.position_accuracy`).
+Figures without the effect of X stand beside those by the truth as given. If truth is positions alone, X is a shift
+(:mod:`rille.stages.evaluation.position_accuracy`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation
 from rille.stages.geometry.lever_arm import MIN_LEVER_FRAMES, fit_lever_arm
 
 MIN_TURN = math.radians(0.5)
-"""Least turn where no shift shows: of a camera that hardly turns, a smaller one is as likely its principal point's."""
+"""Least turn of X without a shift: a smaller one may as well be due to the principal point."""
 
 
 WITHOUT = {
@@ -34,11 +34,11 @@ WITHOUT = {
         *("nees", "nees_position", "nees_rotation"),
     )
 }
-"""Names of the figures with X left out, by those of the same figures as given."""
+"""Names of the figures without the effect of X, by those of the same figures as given."""
 
 
 def hand_eye(estimate: Floats, truth: Floats) -> Floats | None:
-    """Constant X (3, 4), m, by which ``truth X`` are the poses of the camera; None where nothing speaks for one.
+    """Constant X (3, 4), m, by which ``truth X`` are the poses of the camera; None if the tracks do not show one.
 
     Parameters
     ----------
@@ -58,25 +58,25 @@ def hand_eye(estimate: Floats, truth: Floats) -> Floats | None:
         rigid.rms(rigid.relative_error(*rigid.steps(estimate, true))[:, :, 3])
         for true in (truth, rigid.compose(truth, found))
     )
-    # 0.5: share of the error of the motions from frame to frame that is left at most: errors of an estimate do not go
-    # with a constant transform of the truth.
+    # 0.5: largest share of the error of the motions from frame to frame that X may leave: it does not explain errors of
+    # an estimate.
     return found if left < 0.5 * as_given else None
 
 
 def _turn(p: Floats, q: Floats, arm: Floats, lever: float) -> Floats:
     """Turn (3, 3) by which motions q (n, 3, 4) of the truth become motions p of a camera's point at ``arm`` (3,), m.
 
-    ``lever``, m, says how much rotations count beside positions.
+    ``lever``, m: weight of rotations against positions.
     """
     moved = np.concatenate([p[:, :, 3] + (p[:, :, :3] - np.eye(3)) @ arm, lever * rotation_log(p[:, :, :3])])
     said = np.concatenate([q[:, :, 3], lever * rotation_log(q[:, :, :3])])
-    # What no motion shows, as the roll about a straight way, stays: the identity counts as much as a share of them.
-    # 0.003: weight of no turn over that of all motions: it draws a turn that they show by as much of it.
+    # A weak prior of no turn keeps angles that no motion determines, as the roll about a straight path.
+    # 0.003: its weight over that of all motions; it reduces a turn that they determine by as much.
     return orthonormal(said.T @ moved + 0.003 * np.linalg.norm(moved) ** 2 * np.eye(3))
 
 
 def without_it(off: Floats, figures: Mapping[str, Metric]) -> dict[str, Metric]:
-    """Size of X (3, 4), and the errors among the figures against the truth without it, by their names."""
+    """Size of X (3, 4), and ``figures`` of the errors without its effect, by their names (:data:`WITHOUT`)."""
     how = "of the truth's body against the camera, beyond what T_body_left says, as it fits the estimate best"
     size = {
         "hand_eye_turn": metric(math.degrees(float(rigid.angle(off))), "deg", f"constant turn {how}"),
