@@ -200,16 +200,22 @@ def tracked(
     ones all that rests on these.
     """
     p, turn, since = make.products, 0, len(make.graph.nodes)
-    torn: dict[int, str] | None = None
+    refused, torn = dict[int, str](), None
     while True:
         if turn and p.crosscheck is not None:
             p.crosscheck = another_program(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
+        found = yield from simultaneous(make, frames, whole, screening, refused | (torn or {}))
         choice = found.choice
         if choice is None:
             return None
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
         matched = yield from matched_pairs(make, choice.rigs)
+        # Of most pairs a wrong rig is the cause, of few their images.
+        impossible = [k for k, level in p.ground.items() if level.error is not None]
+        if 0 < 2 * len(impossible) < len(matched):
+            refused |= dict.fromkeys(impossible, ODD)
+            make.again(since)
+            continue
 
         # Behind each basic pair: tracks, and poses in its frame. A frame is known by its place in the chain.
         ways = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
