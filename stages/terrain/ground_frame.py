@@ -118,7 +118,8 @@ def level(
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return _on_ground(ground, R_local_left, samples, rig, source or GROUND_PLANE)
     except DegenerateError as error:
-        why, other = _explained(error, samples, ground)
+        below = _matched_below(matches, rig, UPRIGHT if known_up is None else known_up)
+        why, other = _explained(error, samples, ground, below)
     up = UPRIGHT if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
@@ -158,15 +159,26 @@ def _hangs(samples: Samples, up: Floats) -> bool:
     with suppress(DegenerateError):
         # cos 45 degrees: beyond, cameras look at the plane rather than along it, as backwards down from a drone.
         plane = fit_plane(samples, lambda n: np.asarray(n @ up <= -0.7))
-        return plane.inliers >= MIN_REFERENCE_SHARE or plane.reach >= MIN_REACH_HEIGHTS
+        # 0.1: of the matches; crowns and eaves of a street make far planes above the cameras that hold 0.05 to 0.07.
+        far = plane.reach >= MIN_REACH_HEIGHTS and plane.inliers >= 0.1
+        return plane.inliers >= MIN_REFERENCE_SHARE or far
     return False
 
 
+def _matched_below(matches: Matches, rig: Rig, up: Floats) -> float:
+    """Share of matched pixels in the lowest quarter of the left image, where ground is seen first."""
+    usable = matches.usable[::4, ::4]
+    row, col = 4.0 * np.indices(usable.shape).reshape(2, -1)
+    rays = rig.left.rays(np.stack([col, row], axis=-1))
+    height = rays @ up / np.linalg.norm(rays, axis=1)
+    return float(usable.ravel()[height <= np.quantile(height, 0.25)].mean())
+
+
 def _explained(
-    error: DegenerateError, samples: Samples, ground: GroundPlane | None
+    error: DegenerateError, samples: Samples, ground: GroundPlane | None, below: float
 ) -> tuple[DegenerateError, GroundPlane | None]:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the other plane that
-    dominates, None where none does."""
+    dominates, None where none does. ``below``: share of matched pixels where ground is seen first."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
         return error, None
     try:
@@ -174,8 +186,12 @@ def _explained(
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
+        message = error.message
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        return DegenerateError(error.code, error.message, remedy=remedy), None
+        if below < 0.5:
+            message += f"; {below:.0%} of the lowest quarter of the left image is matched"
+            remedy = f"look there at both images (dirt or drops on a lens, a torn part, glare, no texture); {remedy}"
+        return DegenerateError(error.code, message, remedy=remedy), None
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
     message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
     remedy = "if that is the ground, state it as world.up in a manifest"

@@ -48,6 +48,11 @@ MIN_JUMP_PX = 1.0
 rig was knocked; of sound rigs it stays below 0.2."""
 
 
+MIN_AGREEING_SHARE = 0.3
+"""Share of the landmarks below which a pose that these agree with is not believed: of a street 0.9 agree, by night and
+beside a mirror 0.6; of a crowd all over the image 0.2 may, with any pose."""
+
+
 MAX_TORN_SHARE = 0.2
 """Share of a basic pair's disparities that depart otherwise than the others, by twice :data:`MIN_JUMP_PX`, from which
 on a part of one image is displaced; of sound pairs 0.02 do, by night 0.1."""
@@ -127,6 +132,9 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
                 posed = posed_by(use, j)
+            if (agreeing := int(posed.inlier.sum())) < MIN_AGREEING_SHARE * use.size:
+                text = f"only {agreeing} of {use.size} landmarks agree with one pose: most move, or are mistracked"
+                raise DegenerateError("RIL-751", text, remedy="mask what moves by itself, or what repeats")
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:

@@ -36,7 +36,11 @@ from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
-from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
+from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, NO_VERTICAL, OWN_COVARIANCE, POSES
+
+MAX_TILT_DEG = 5.0
+"""Degrees between the verticals by the ground of two pairs: on a street and in a hall at most 2.7, by bad matches 5 to
+28."""
 
 
 class ChainLink(NamedTuple):
@@ -190,6 +194,28 @@ def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle])
     return sources
 
 
+def _unlike_verticals(
+    frames: Sequence[int], found: Chained, keys: Sequence[int], levels: Sequence[Bundle]
+) -> Iterator[str]:
+    """Lines on pieces whose vertical is that of the ground of their first pair, and not that of the others' ground.
+
+    ``keys`` are the rows of the pairs that ``levels`` are of.
+    """
+    for piece in range(int(found.piece.max()) + 1):
+        tilts = dict[int, float]()
+        for key, level in zip(keys, levels, strict=True):
+            if found.piece[key] == piece and level.meta["source"] == GROUND_PLANE:
+                up = found.poses[key, :, :3] @ RigidTransform.from_matrix(level.meta["T_local_left"]).rotation[2]
+                tilts[frames[key]] = math.degrees(math.atan2(math.hypot(up[0], up[1]), up[2]))
+        odd = [frame for frame, tilt in tilts.items() if tilt > MAX_TILT_DEG]
+        if odd:
+            yield (
+                f"by the ground of {len(odd)} of {len(tilts)} pairs, first pair {odd[0]}, the vertical is off by up to "
+                f"{max(tilts.values()):.0f} degrees: the ground bends, or is matched badly, and slopes and hazards are "
+                "wrong; state world.up or world.pitch_deg, or give an attitude"
+            )
+
+
 def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
     """Facts of a trajectory, and lines on what is missing.
 
@@ -300,4 +326,5 @@ def trajectory_stage(
         "inliers": [inliers.get(f, 0) for f in frames],
         **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
     }
+    meta["warnings"] += _unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)
     return Bundle(vars(found), meta)
