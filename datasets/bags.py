@@ -196,9 +196,9 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
 
 
 def _check_clock(found: Mapping[int, TakenImage], where: str) -> None:
-    """Refuse images, in the order of their stamps, whose clock was set back during the recording.
+    """Refuse images whose clock was set back meanwhile; ``found``: images by stamp, in order of their recording.
 
-    A single image may be written late; after a clock was set back all later ones are.
+    Single images may be written late; after a clock was set back all later ones are.
     """
     stamps, late = np.array(list(found)), np.array([one.at - stamp for stamp, one in found.items()])
     for k in 1 + np.flatnonzero(np.diff(stamps) < 0):

@@ -153,8 +153,8 @@ def _ascending(stems: Sequence[str]) -> list[str]:
 
 
 def _begun_anew(ordered: Sequence[str]) -> int:
-    """Index of the first of ordered names after which a counter that had reached its last number (999) began anew from
-    0, or from 1 as in cameras (DCF); 0: none did, or it cannot be told, as more numbers are missing than present."""
+    """Index, in ordered names, of the image taken first, if a counter has reached its last number (999) and gone on
+    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; else 0."""
     digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
     if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
         return 0
