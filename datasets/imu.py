@@ -123,6 +123,11 @@ def _columns(table: TextTable) -> tuple[list[int], list[int]]:
     return gyro, accelerometer
 
 
+def names_sensors(table: TextTable) -> bool:
+    """Whether columns are named as the rates and the forces of an IMU."""
+    return all(_named(table, sensor) for sensor in (GYROSCOPE, ACCELEROMETER))
+
+
 def _named(table: TextTable, starts: re.Pattern[str]) -> list[int]:
     """The three columns x y z whose names begin so; empty unless there are exactly three."""
     found = [k for k, name in enumerate(table.header) if starts.match(name)]

@@ -23,7 +23,8 @@ from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
-from rille.datasets.poses import names_positions, of_images, positions_of
+from rille.datasets.imu import names_sensors
+from rille.datasets.poses import matrix_at, names_positions, of_images, positions_of
 from rille.datasets.text.reading import Search, is_file, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -33,7 +34,7 @@ DEPTH = 4
 """Levels of folders that are searched; deeper ones are other data sets."""
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json")
-TABLES = (".txt", ".csv", ".tum", ".dat")
+TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
@@ -343,10 +344,13 @@ def table_kind(path: Path, pairs: int) -> str:
     except (InputError, ValueError):  # such as names of images, and dates
         return named
     header = " ".join(table.header)
-    if any(word in header for word in ("gyro", "w_rs", "ang_vel", "angular", "accel")) and row.size >= 7:
+    words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
+    if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
+    if matrix_at(table) is not None:
+        return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None
     # Without times there must be one for each pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
@@ -355,10 +359,7 @@ def table_kind(path: Path, pairs: int) -> str:
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
-    if row.size in (12, 16):
-        rotation = row.reshape(-1, 4)[:3, :3]
-        return "truth" if np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 else ""
-    if row.size >= 8 and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
+    if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
     if row.size == 1 and (rows == pairs or named):
         return "times"

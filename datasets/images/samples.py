@@ -145,7 +145,8 @@ def interlaced(image: AnyArray) -> bool:
 def fixed_pattern(images: list[AnyArray]) -> float:
     """Share of the finest detail that stays in place in some images (row, col) of a camera, in the median block.
 
-    0 if coarser detail does too, as with a camera at rest.
+    0 if coarser detail does too, as with a camera at rest. Coarser detail is measured without single pixels, since hot
+    ones would outweigh a dark scene in the means of their surroundings.
     The mean of n images keeps one n-th of the variance of a moving scene, and all of a fixed pattern's.
     """
     if len(images) < 3 or len({image.shape for image in images}) > 1 or min(images[0].shape) < 4 * BLOCK:
@@ -154,7 +155,9 @@ def fixed_pattern(images: list[AnyArray]) -> float:
     def kept(factor: int) -> float:
         """The share in images reduced by a factor."""
         size = images[0].shape[1] // factor, images[0].shape[0] // factor
-        small = [cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA) for image in images]
+        taken = [image.astype(np.float32) for image in images]
+        taken = taken if factor == 1 else [cv2.medianBlur(image, 3) for image in taken]
+        small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in taken]
         details = np.stack([np.asarray(image - cv2.blur(image, (5, 5))) for image in small])
         blocks = size[0] // BLOCK, size[1] // BLOCK
         mean, all_ = (

@@ -45,6 +45,7 @@ TIME = re.compile("time|stamp", re.IGNORECASE)
 """Part of the title of a column of times."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
+NUMBERS_AS_TIMES = 'names = true with unit = "s" takes those in the names of the images for seconds'
 
 
 @dataclass
@@ -193,7 +194,9 @@ class MotionReader:
         if timed.times is not None:
             if self.sequence.times is None:
                 text = f"the poses of {path} have times, but the pairs have none"
-                raise InputError("RIL-231", text, remedy=NEEDS_TIMES)
+                numbered = all(t == int(t) for t in timed.times)
+                remedy = NEEDS_TIMES + (f"; if they are numbers of frames, {NUMBERS_AS_TIMES}" if numbered else "")
+                raise InputError("RIL-231", text, remedy=remedy)
             moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
             poses = interpolate(moved, self.sequence.times, section.max_gap)
             self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))

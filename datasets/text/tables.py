@@ -131,7 +131,8 @@ def read_table(path: Path, what: str) -> TextTable:
     """
     lines = read_lines(path, what)
     if form := STRUCTURED.match("\n".join(lines[:SAMPLE])):
-        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, all in metres"
+        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres"
+        remedy += " (degrees of latitude and longitude projected, as to UTM)"
         raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=remedy)
     names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []

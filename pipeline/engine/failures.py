@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
+import tempfile
+from pathlib import Path
 
+from rille.datasets.text.reading import is_broken
 from rille.stages.core.errors import ConfigError, RilleError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -20,13 +24,28 @@ def translated(error: BaseException) -> RilleError | None:
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         kind = ConfigError if error.errno == errno.ENAMETOOLONG else RilleError
-        return kind("RIL-737", f"{where}{error.strerror}", remedy=remedy_of(error.errno))
+        remedy = remedy_of(error.errno)
+        if error.errno in FULL and str(error.filename).startswith(
+            f"{tempfile.gettempdir()}/{tempfile.gettempprefix()}"
+        ):
+            remedy = "free space there, or set TMPDIR to a folder that has more"
+        return kind("RIL-737", f"{where}{reason_of(error)}", remedy=remedy)
     library = type(error).__module__.split(".")[0]
     if library == "cv2":
         return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")
     if library == "rasterio":
         return RilleError("RIL-739", f"cannot write or read a raster: {error}", remedy="check the space in --runs")
     return None
+
+
+def reason_of(error: OSError) -> str:
+    """Why the system refused, in words."""
+    if not error.filename and error.errno == errno.ENOENT:
+        return "the current folder was removed"
+    path = Path(str(error.filename or ""))
+    if gone := [link for link in (path, *path.parents) if is_broken(link)]:
+        return f"{gone[0]} is a link to {os.readlink(gone[0])}, which is missing"
+    return str(error.strerror)
 
 
 def remedy_of(number: int) -> str:

@@ -405,6 +405,8 @@ class Dask:
         elif now - self._manned > patience:
             text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
             remedy = "start workers, and run the same command: what is committed stays"
+            if self._cluster is not None:  # Python's own file may be closed to this user, or memory be short
+                remedy = "look why this user can start no processes, or run it with --executor inline, which needs none"
             raise RilleError("RIL-525", text, remedy=remedy)
         return sum(workers.values())
 

@@ -199,16 +199,22 @@ def tracked(
     Repeat without the images, or with corrected cameras, that the tracks contradict.
     """
     p, attempt, since = make.products, 0, len(make.graph.nodes)
-    torn: dict[int, str] | None = None
+    refused, torn = dict[int, str](), None
     while True:
         if attempt and p.crosscheck is not None:
             p.crosscheck = crosscheck_tasks(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening, dict(torn or {}))
+        found = yield from simultaneous(make, frames, whole, screening, refused | (torn or {}))
         choice = found.choice
         if choice is None:
             return None
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
         matched = yield from matched_pairs(make, choice.rigs)
+        # Of most pairs a wrong rig is the cause, of few their images.
+        impossible = [k for k, level in p.ground.items() if level.error is not None]
+        if 0 < 2 * len(impossible) < len(matched):
+            refused |= dict.fromkeys(impossible, MISFIT)
+            make.discard(since)
+            continue
 
         # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
         runs = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]

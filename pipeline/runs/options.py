@@ -186,7 +186,7 @@ def check_output(path: Path, *endings: str, option: str = "--output", others: Ma
     Raises
     ------
     ConfigError
-        ``path`` is a folder, has another ending, or is one of the others.
+        ``path`` is a folder, has another ending, or is one of the others; or nothing can be written there.
     """
     if path.resolve() in others:
         text = f"{option} and {others[path.resolve()]} are both {path}"
@@ -196,6 +196,11 @@ def check_output(path: Path, *endings: str, option: str = "--output", others: Ma
     if endings and path.suffix.lower() not in endings:
         allowed = " or ".join(endings)
         raise ConfigError("RIL-871", f"the output {path} has another ending", remedy=f"end it in {allowed}")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        why = "may not be written" if above.is_dir() else "is no folder"
+        remedy = f"check its rights, or give another {option}"
+        raise ConfigError("RIL-746", f"the output {path} cannot be written: {above} {why}", remedy=remedy)
 
 
 def check_new(path: Path, but: str = "", remedy: str = "give another --output, or remove it") -> None:

@@ -25,6 +25,7 @@ from rille.datasets.text.warning import warning
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
+from rille.pipeline.engine.failures import reason_of
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
@@ -330,7 +331,7 @@ def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
         except OSError as error:
             if folder.is_dir():
                 continue
-            text = f"cannot make {folder}: {error.strerror}"
+            text = f"cannot make {folder}: {reason_of(error)}"
             raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
 

@@ -23,6 +23,7 @@ TRANSPOSED = "it is transposed"
 def readings(lens: Lens) -> dict[str, Lens]:
     """Other lenses that the coefficients may describe, by the name of the reading."""
     c, found = lens.coefficients, {"the images are free of distortion already": Lens(lens.camera)}
+    found["they have the other sign"] = replace(lens, coefficients=tuple(-v for v in c))
     for model, other in (("radtan", "fisheye"), ("fisheye", "radtan")):
         if lens.model == model and len(c) == 4:
             found[f"they are those of model {other}"] = replace(lens, model=other)

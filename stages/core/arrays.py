@@ -1,4 +1,4 @@
-"""Types of arrays by what they hold, one name each; shapes, units and frames are said where they are used."""
+"""Names of array types by the kind of their values; shapes, units and frames stand where they are used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a stage declares itself: parameters, inputs and the arrays it produces."""
+"""Declaration of a stage: its parameters, inputs, output arrays and facts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AnyArray = NDArray[Any]
 class Facts(TypedDict, total=False):
     """Base of the facts that a stage declares: names and types of what its results' ``meta`` holds.
 
-    A module of facts does without ``from __future__ import annotations``, by which ``NotRequired`` would not count.
+    A module of facts has no ``from __future__ import annotations``, with which ``NotRequired`` would have no effect.
     """
 
     warnings: list[str]
@@ -46,12 +46,12 @@ class Params(BaseModel):
 
 
 class NoParams(Params):
-    """For stages that have nothing to set."""
+    """Parameters of a stage that has none."""
 
 
 @dataclass(frozen=True)
 class Array:
-    """One output array: what an artifact's reader needs to know.
+    """Description of one output array, for readers of an artifact.
 
     ``name`` may end in ``*`` for a family (``level_*``). ``nodata`` is ``"nan"``, a number as text or empty.
     ``deep`` is another type that the array may have instead of ``dtype``.
@@ -73,7 +73,7 @@ class Array:
 
 
 def raster(name: str, unit: str, long_name: str, dtype: str = "float32", nodata: str = "nan", frame: str = "") -> Array:
-    """An output (row, col)."""
+    """Describe an output array (row, col)."""
     return Array(name, ("row", "col"), dtype, unit, long_name, nodata, frame)
 
 
@@ -242,7 +242,7 @@ def stage(
 
 
 def _reader(annotation: Any) -> Callable[[Any], Any] | None:
-    """How an argument of this type (or of it or None) is made of JSON; None for one that is JSON itself."""
+    """Function that makes an argument of this type (or of it or None) from JSON; None: it is JSON itself."""
     for kind in (annotation, *get_args(annotation)):
         for name in ("from_dict", "from_matrix", "model_validate"):
             if isinstance(kind, type) and hasattr(kind, name):
@@ -262,7 +262,7 @@ def declared(module: Any) -> Stage[Any, Any] | None:
 
 
 def check_outputs(stage: Stage, bundle: Bundle) -> None:
-    """Raise ``TypeError`` where a bundle departs from its stage's declaration (a programming error)."""
+    """Raise ``TypeError`` if a bundle departs from its stage's declaration (a programming error)."""
     for name, array in bundle.arrays.items():
         spec = next((a for a in stage.outputs if a.matches(name)), None)
         if spec is None:

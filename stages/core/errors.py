@@ -36,7 +36,7 @@ class RilleError(Exception):
 
 @contextmanager
 def within(where: str) -> Iterator[None]:
-    """Put the place in front of what is raised inside, unless it is there."""
+    """Put the place in front of errors raised inside, unless it is there."""
     try:
         yield
     except RilleError as error:
@@ -46,7 +46,7 @@ def within(where: str) -> Iterator[None]:
 
 
 def did_you_mean(text: str, names: Iterable[str], prefix: str = "") -> str:
-    """The question whether one of the names that are like a text was meant, with a prefix; empty where none is."""
+    """Ask, after a prefix, whether one of the names like a text was meant; empty if none is like it."""
     known = list(dict.fromkeys(names))
     alike = difflib.get_close_matches(text, known, n=3, cutoff=0.6) or [n for n in known if text and text in n][:3]
     return f"did you mean {' or '.join(prefix + name for name in alike)}?" if alike else ""

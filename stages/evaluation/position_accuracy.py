@@ -120,7 +120,7 @@ def _jump(antenna: Floats, truth: Floats, upright: bool) -> str:
     if not jumps.any() or left > MAX_ERROR_SHARE * error:
         return ""
     at, size = int(jumps.argmax()), float(np.linalg.norm(off[jumps.argmax()]))
-    text = f"jump by {size:.2g} m against the trajectory behind {at + 1} of {len(truth)} of them: {error:.2g} m RMS are"
+    text = f"jump by {size:.2g} m against the trajectory after {at + 1} of {len(truth)} of them: {error:.2g} m RMS are"
     return f"{text} left, without that {left:.2g} m: correct or remove rows there, unless it is the trajectory's error"
 
 

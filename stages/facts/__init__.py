@@ -1,1 +1,1 @@
-"""Facts of the stages: what their results state beside arrays, by the room that states it."""
+"""Facts of the stages: statements of their results beside arrays, one module for each package of stages."""

@@ -6,7 +6,7 @@ from rille.stages.core.declare import Facts
 
 
 class CalibrationFacts(Facts):
-    """``rig`` (:meth:`Rig.to_dict`) that is computed with, its ``baseline``, m, and whether it was ``changed``."""
+    """``rig`` (its ``to_dict``) that is computed with, its ``baseline``, m, and whether it was ``changed``."""
 
     rig: dict[str, Any]
     baseline: float
@@ -36,7 +36,7 @@ class RigFacts(Facts):
     """The rig to be used; without a pair that can be used, the first six facts and ``warnings`` alone."""
 
     rig: dict[str, Any]
-    """To be used, as :meth:`Rig.to_dict` gives it."""
+    """To be used, as ``Rig.to_dict`` gives it."""
     given: dict[str, Any]
     mode: str
     baseline: float

@@ -25,9 +25,9 @@ class StepTableFacts(Facts):
 class ScreeningFacts(Facts):
     """Frames that the trajectory goes through, and those that it does not.
 
-    ``asks``: what must be known for an answer, ``bridges`` (pairs of frames) and ``sides`` (frames); where both are
-    empty the rest is final. ``lost`` are frame and cause, ``late`` those of them whose left and right are not of one
-    time, ``unfit`` frames that may not be basic, ``match_rate`` the shares along the ``chain``.
+    ``asks``: facts still needed, by ``bridges`` (pairs of frames) and ``sides`` (frames); if both are empty the rest is
+    final. ``lost`` are frame and cause, ``late`` those of them whose left and right are not of one time, ``unfit``
+    frames that may not be basic, ``match_rate`` the shares along the ``chain``.
     """
 
     asks: dict[str, list[Any]]

@@ -43,7 +43,7 @@ class GroundFacts(Facts):
 
 
 class DemFacts(Facts):
-    """Elevation model of a basic ``pair`` on a ``lattice`` (:meth:`Lattice.to_dict`) of a ``frame``."""
+    """Elevation model of a basic ``pair`` on a ``lattice`` (its ``to_dict``) of a ``frame``."""
 
     lattice: Json
     frame: str

@@ -1,4 +1,4 @@
-"""Coarse levels of a pair, step by step: brightness, prior disparities, alignment by a plane or keypoints, focus.
+"""Coarse levels of a pair, step by step: brightness, alignment by a plane or keypoints, focus.
 
 Focus: where one image shows less detail, distances of features and residuals of the refinement measure the blur instead
 of the displacement. At the finest level the sharper image is then blurred by a Gaussian to the same detail.
@@ -26,7 +26,6 @@ from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, guess, levelle
 from rille.stages.hfvm.image import Image, thinned
 from rille.stages.hfvm.level import FREE_BAND, PyramidPair, State, descend, sample, textured
 from rille.stages.hfvm.native.problem import Map
-from rille.stages.hfvm.prior import PriorDisparities, bounded, impose
 
 COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
@@ -49,8 +48,8 @@ class Coarse:
     """A pair of images and its matches at a coarse level, ``state``.
 
     ``images``: the images as they are matched: the right one in the left one's brightness, divided by ``ratio``, and
-    aligned by the homography ``alignment`` (None: neither). ``given``: the right one as it came. ``prior``: disparities
-    known beforehand. ``blur``: of the left and the right image in the refinement, pixels (:func:`focus`).
+    aligned by the homography ``alignment`` (None: neither). ``given``: the right one as it came. ``blur``: of the left
+    and the right image at the finest level, pixels (:func:`focus`).
     """
 
     images: PyramidPair
@@ -58,7 +57,6 @@ class Coarse:
     given: Image
     ratio: Floats | None = None
     alignment: plane.Matrix | None = None
-    prior: PriorDisparities | None = None
     blur: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
@@ -135,21 +133,12 @@ def even(coarse: Coarse) -> Coarse:
     return coarse
 
 
-def known(coarse: Coarse) -> Coarse:
-    """Replace displacements by the prior ones where these are known."""
-    prior, h = coarse.prior, coarse.alignment
-    if prior is not None and h is not None:
-        # Near the horizon of the plane carried displacements exceed all bounds.
-        prior = bounded(*plane.carried(np.linalg.inv(plane.to_original(h, prior.u.shape)), prior.u, prior.v))
-    return replace(coarse, state=impose(coarse.images, coarse.state, prior))
-
-
 def align(coarse: Coarse) -> Coarse:
     """Align the right image by the dominant plane, where one explains the matches."""
     # 0.8: share of consistent pixels below which a plane of fewer matches counts.
     few = coarse.share < 0.8
     h = plane.find(sample(coarse.images, coarse.state), coarse.state.level, coarse.images.left.shapes, few)
-    return coarse if h is None else known(coarse.anew(alignment=h))
+    return coarse if h is None else coarse.anew(alignment=h)
 
 
 def turn(coarse: Coarse) -> Coarse:
@@ -159,7 +148,7 @@ def turn(coarse: Coarse) -> Coarse:
     # 0.6: share of consistent pixels up to which the images may be turned, or far apart: by chance up to .23 are
     # consistent, with preset ``accurate``, which smooths more, up to .46; pairs of usual rigs have .8 and more.
     few = unlike or coarse.share <= 0.6
-    h = plane.find_turn(left, given) if few and coarse.prior is None else None
+    h = plane.find_turn(left, given) if few else None
     if h is None:
         return coarse
     # Brightness can be compared only once the images are upright.
@@ -237,9 +226,9 @@ def focus(coarse: Coarse) -> Coarse:
     return replace(coarse, blur=(0.0, blur) if side else (blur, 0.0))
 
 
-def match_coarse_levels(images: PyramidPair, prior: PriorDisparities | None = None) -> Coarse:
+def match_coarse_levels(images: PyramidPair) -> Coarse:
     """The coarse levels of two images as they are, down to level 1 or, of small images, to the top."""
-    coarse = Coarse(images, descend(images, COARSE_LEVEL), images.right, prior=prior)
-    for step in images.params.kept((even, known, align, turn)):
+    coarse = Coarse(images, descend(images, COARSE_LEVEL), images.right)
+    for step in images.params.kept((even, align, turn)):
         coarse = step(coarse)
     return focus(replace(coarse, state=descend(coarse.images, 1, coarse.state, coarse.state.near_sign)))

@@ -5,8 +5,8 @@ only a help to the search: it is estimated anew at every level and never leaves 
 
 The constraint ``p'^T F p = 0`` is linear in F. Divided by the coefficient of ``y'`` it reads ``y' = y + small`` for a
 rig whose baseline lies along the rows, divided by that of ``x'`` likewise for one along the columns; both are fitted as
-a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which decides what a
-flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
+a maximum a posteriori with a weak prior on the small terms (a few degrees of roll and toe-in), which determines the
+terms that a flat scene leaves open. The first one is taken where most matches lie on its lines, else the likelier one.
 """
 
 from __future__ import annotations

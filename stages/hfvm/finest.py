@@ -1,4 +1,4 @@
-"""The finest level of a pair and what follows, window by window: of the whole image, or of tiles, each with a halo.
+"""The finest level of a pair and the steps after it, window by window: the whole image, or tiles with a halo.
 
 ::
 

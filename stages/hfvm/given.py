@@ -14,9 +14,11 @@ judged half; without this part 60 and 86, 56 and 82. 2026-11-26."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Bundle, Memory, stage
 from rille.stages.core.validity import Validity, matched
@@ -25,23 +27,24 @@ from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, levelled, ratio_of_matches
 from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import as_matched
+from rille.stages.hfvm.image import Shape, as_matched
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.prior import PriorDisparities, impose, known_beforehand
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
 
 
-def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmParams) -> dict[str, AnyArray]:
-    """Arrays of :class:`~rille.stages.hfvm.stage.StereoMatches` of given displacements, of which columns are kept.
+def check(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams) -> dict[str, AnyArray]:
+    """Arrays of :class:`~rille.stages.hfvm.stage.StereoMatches` of given column displacements (row, col), NaN unknown.
 
     ``params``: thresholds of the checks; those of preset ``paper`` have other units, and the default's are taken.
     """
     params = HfvmParams() if params.preset in matcher.WHOLE else params
-    known = np.isfinite(given.u)
-    u, zeros = np.where(known, given.u, np.float32(0.0)), np.zeros_like(given.u)
+    # Displacements of a level are 16-bit and doubled from level to level. NaN is not less, and so unknown as well.
+    known = np.abs(column) < 16000
+    u = np.where(known, column, 0.0).astype(np.float32)
+    zeros = np.zeros_like(u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
     a, b = as_matched(left, params), as_matched(right, params)
     inside = lands(np.rint(u), zeros, known, right.valid[0])
@@ -49,7 +52,9 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
         b = levelled(b, ratio)
     images, left_layer, right_layer = PyramidPair(a, b, params, matcher.DEFAULT), a.layers[0], b.layers[0]
-    work = FinestWork(left_layer, right_layer, right_layer, there, _way_back(images, given), images)
+    work = FinestWork(
+        left_layer, right_layer, right_layer, there, _way_back(images, np.where(known, u, np.float32(np.nan))), images
+    )
     fine = finest.check(work, replace(finest.subpixel(work), u=u))
     fine = replace(fine, validity=fine.against(~known, Validity.OVER_THRESHOLD))
     fine = finest.refine(work, fine)
@@ -61,25 +66,50 @@ def check(left: Pyramid, right: Pyramid, given: PriorDisparities, params: HfvmPa
     return finest.complete(results, left_layer.valid, left_layer.window, params, Ending(left_layer.shape, f=lines))
 
 
-def _way_back(images: PyramidPair, given: PriorDisparities) -> Map:
-    """Displacements of the right image, matched at the finest level near the given ones."""
+def _way_back(images: PyramidPair, column: AnyArray) -> Map:
+    """Displacements of the right image, matched at the finest level near the given ones (row, col), NaN unknown."""
     above = None
     if images.levels > 1:
-        shapes = images.left.shapes[1], images.right.shapes[1]
-        left, right = (Map(*np.zeros((2, *shape), np.int16)) for shape in shapes)
-        unknown = np.zeros(shapes[0], bool), np.zeros(shapes[1], bool)
-        above = impose(images, State(1, left, right, *unknown, FREE_BAND, NEAR_SIGN), given).reverse()
+        left, right = (image.layers[1] for image in (images.left, images.right))
+        u, known = _halved(column, left.shape)
+        back, hit = _reverse(u, known, right.shape)
+        maps = Map(back, np.zeros_like(back)), Map(u, np.zeros_like(u))
+        above = State(1, *maps, hit & (right.valid != 0), known, FREE_BAND, -NEAR_SIGN)
     return one_way(images.reverse(), 0, above, -NEAR_SIGN, images.recipe.rounds[1])
+
+
+def _halved(column: AnyArray, shape: Shape) -> tuple[AnyArray, NDArray[np.bool_]]:
+    """Column displacements of level 1, of ``shape``: medians of the known ones of each block, whole pixels (int16)."""
+    padded = np.full((2 * shape[0], 2 * shape[1]), np.nan, np.float32)
+    padded[: column.shape[0], : column.shape[1]] = column
+    blocks = padded.reshape(shape[0], 2, shape[1], 2).swapaxes(1, 2).reshape(*shape, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # blocks without any are NaN, as they should be
+        # No means: of a block across a depth edge they lie on neither surface.
+        u = np.nanmedian(blocks, axis=2) / 2
+    known = np.isfinite(u)
+    return np.rint(np.where(known, u, 0.0)).astype(np.int16), known
+
+
+def _reverse(u: AnyArray, known: NDArray[np.bool_], shape: Shape) -> tuple[AnyArray, NDArray[np.bool_]]:
+    """Column displacements of the right image, of ``shape``, and where they are known: each left one at its end."""
+    y, x = np.nonzero(known)
+    # From far to near, since of several that end at a pixel the last one stays: the one that hides the others.
+    order = np.argsort(NEAR_SIGN * u[y, x].astype(np.float64), kind="stable")
+    y, x = y[order], x[order]
+    end = x + u[y, x].astype(np.intp)
+    inside = (end >= 0) & (end < shape[1]) & (y < shape[0])
+    y, x, end = y[inside], x[inside], end[inside]
+    back, hit = np.zeros(shape, np.int16), np.zeros(shape, bool)
+    back[y, end], hit[y, end] = -u[y, x], True
+    return back, hit
 
 
 @stage("hfvm_given", outputs=OUTPUTS, memory=Memory(fixed=30e6, factor=10.0, result=1.6))
 def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bundle) -> Bundle[DisparityFacts]:
     """Disparities that another program made, checked against the images of a stereo pair."""
     a, b = Pyramid.from_bundle(left), Pyramid.from_bundle(right)
-    column = np.asarray(given["column_disparity"])
-    prior = known_beforehand((column, np.zeros_like(column)), a.shape)
-    assert prior is not None
-    arrays = check(a, b, prior, params)
+    arrays = check(a, b, np.asarray(given["column_disparity"]), params)
     if "disparity_std" in given.arrays:
         # Where a map of it says nothing the estimate stays.
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)

@@ -19,7 +19,6 @@ from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import PyramidPair, Recipe
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.prior import PriorDisparities
 from rille.stages.imaging.pyramid import Pyramid
 
 DEFAULT = Recipe(
@@ -123,16 +122,16 @@ def _slopes(a):  # type: ignore[no-untyped-def]
 
 
 Tell = Callable[[float, str], None]
-"""Called with the share of the work done, 0..1, and what comes next in words."""
+"""Progress callback: takes the share of the work done, 0..1, and the name of the next part."""
 
 
 def silent(share: float, step: str) -> None:
-    """Tell nothing."""
+    """Report no progress."""
 
 
 class How(NamedTuple):
-    """How a pair is matched. ``tell``: called with the progress. ``side``: pixels of a tile, None: the whole image.
-    ``threads``: that share the work; they change no bit of the result."""
+    """Options of a match besides its parameters: progress callback ``tell``; ``side`` of a tile, pixels (None: whole
+    images); number of ``threads``, which changes no bit of the result."""
 
     tell: Tell = silent
     side: int | None = None
@@ -142,20 +141,18 @@ class How(NamedTuple):
 Arrays = dict[str, AnyArray]
 
 
-def match(
-    left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None, how: How
-) -> tuple[Arrays, Unlike]:
+def match(left: Pyramid, right: Pyramid, params: HfvmParams, how: How) -> tuple[Arrays, Unlike]:
     """Dense displacements from the left image to the right one (4.3), step by step.
 
     Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and how the right image differs.
     """
     if halves(params, left.levels, right.levels):
-        half, unlike = match(left.above(1), right.above(1), halved(params), prior and prior.halved(), how)
+        half, unlike = match(left.above(1), right.above(1), halved(params), how)
         return doubled(half, left.valid[0], right.shape, (0, 0)), unlike.doubled()
     how.tell(0.0, "coarse levels")
     pyramids = as_matched(left, params), as_matched(right, params)
     images = PyramidPair(*pyramids, params, RECIPES[params.preset], how.threads)
-    pair = coarse.match_coarse_levels(images, prior)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
+    pair = coarse.match_coarse_levels(images)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
     how.tell(0.15, "fine levels")
     side = how.side if local(params) and images.levels > 1 else None
     windows = [whole(left.shape)] if side is None else cut(left.shape, side)

@@ -31,7 +31,7 @@ DEFAULT_TABLE: tuple[float, ...] = (*(-v for v in _HALF[:0:-1]), *_HALF)
 """Even offset at each sixteenth of the found one; learnt on noise of spectrum 1 / f^1.3, displaced by all fractions."""
 
 
-def even(offsets: ArrayLike, table: tuple[float, ...] = DEFAULT_TABLE) -> NDArray[np.float32]:
+def equalized(offsets: ArrayLike, table: tuple[float, ...] = DEFAULT_TABLE) -> NDArray[np.float32]:
     """Offsets mapped by a table, linear between its knots."""
     knots = np.linspace(-0.5, 0.5, len(table))
     return np.asarray(np.interp(np.asarray(offsets), knots, np.asarray(table)), dtype=np.float32)
@@ -62,14 +62,14 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
         maps = [Map(cv2.medianBlur(way.u, 3), cv2.medianBlur(way.v, 3)) for way in ways]
         if n == 0:
             break
-        # 4.3.3: what matching back does not confirm is interpolated, and handed down
+        # 4.3.3: pixels that fail back-matching are interpolated, and handed down
         ok = [agree(maps[k], maps[1 - k], layers[k].valid, layers[1 - k].valid, params.backmatch) for k in (0, 1)]
         ok = [o & (way.distance >= 0) & (way.distance <= params.threshold) for o, way in zip(ok, ways, strict=True)]
         state = State(n, maps[0], maps[1], ok[0], ok[1], FREE_BAND, NEAR_SIGN)
         above = hand_down(state, params), hand_down(state.reverse(), params)
     # 4.3.2 and 4.3.3 at the finest level: fractions of a pixel, back-matching, interpolation
     ways = [search(vectors[k], vectors[1 - k], maps[k], (0, 0)) for k in (0, 1)]
-    fine = [Map(*(whole + even(way.offset[..., i]) for i, whole in enumerate(way[:2]))) for way in ways]
+    fine = [Map(*(whole + equalized(way.offset[..., i]) for i, whole in enumerate(way[:2]))) for way in ways]
     error, validity = reasons(fine[0], fine[1], ways[0].distance, (layers[0], layers[1]), params, planes[0][DEVIATION])
     arrays = {"u": fine[0].u, "v": fine[0].v, "validity": validity, "error": error, "distance": ways[0].distance}
     arrays["noise"] = np.zeros_like(error)

@@ -25,8 +25,8 @@ Stiffness begins weak and tolerant of bends: at full strength it would keep the 
 relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.epipolar`); k is reduced where matches
 do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
 
-**Standard deviations** of the column disparities, of the rows' where epipolar lines run along the columns, come from
-what the matcher knows at each pixel.
+**Standard deviations** of the column disparities, or of the rows' where epipolar lines run along the columns, are
+computed from figures of each pixel.
 
 The error of a disparity is taken as the sum of independent parts, so that variances add:
 

@@ -5,7 +5,7 @@ the method on one page, in the order of the paper, and each preset as a list of 
 :class:`~rille.stages.hfvm.params.HfvmParams`).
 
 - ``image``: grey values, masks and features of windows of an image; ``coarse``: the levels down to 1, with
-  ``brightness``, ``prior`` disparities, alignment by a ``plane``, and focus.
+  ``brightness``, alignment by a ``plane``, and focus.
 - ``level``: one level: search, propagation, paths, depth edges, check, band (``epipolar``). ``native``: its loops.
 - ``finest``: the finest level, window by window; ``refinement`` of displacements, and their standard deviations;
   ``textureless``: planes.
@@ -28,7 +28,6 @@ from rille.stages.hfvm import matcher, paper
 from rille.stages.hfvm.coarse import Unlike
 from rille.stages.hfvm.matcher import WHOLE, How
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.prior import PriorDisparities, known_beforehand
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
 
@@ -73,7 +72,6 @@ def match(
     params: HfvmParams | None = None,
     *,
     valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
-    prior: tuple[AnyArray, AnyArray] | None = None,
     how: How = HOW,
 ) -> StereoMatches:
     """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
@@ -83,15 +81,13 @@ def match(
     left, right : (row, col) grey images, uint8, uint16 or floating point 0..255; sizes may differ.
     params : matcher's parameters; None: preset ``default``.
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
-    prior : column and row disparities of the left image, pixels, NaN undefined, to start from (see
-        :mod:`rille.stages.hfvm.prior`); None: nothing is known.
     how : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
         Presets ``accurate`` and ``paper`` are matched whole.
 
     Raises
     ------
     InputError
-        An image is not grey or empty, or a mask or the prior has another shape.
+        An image is not grey or empty, or a mask has another shape.
 
     Notes
     -----
@@ -100,17 +96,15 @@ def match(
     """
     levels = PyramidParams()
     a, b = (pyramid.build(image, levels, usable) for image, usable in zip((left, right), valid, strict=True))
-    return match_pyramids(a, b, params or HfvmParams(), known_beforehand(prior, left.shape), how)
+    return match_pyramids(a, b, params or HfvmParams(), how)
 
 
-def match_pyramids(
-    left: Pyramid, right: Pyramid, params: HfvmParams, prior: PriorDisparities | None = None, how: How = HOW
-) -> StereoMatches:
+def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams, how: How = HOW) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
         arrays, unlike = paper.match(left, right, params, how.tell), Unlike()
     else:
-        arrays, unlike = matcher.match(left, right, params, prior, how)
+        arrays, unlike = matcher.match(left, right, params, how)
     return StereoMatches(**arrays, unlike=unlike)
 
 

@@ -34,6 +34,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.special import betainc
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, plane
@@ -182,7 +183,7 @@ def _update(region, step, sums, state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _judge(region, state, found):  # type: ignore[no-untyped-def]
-    """Write what all steps together tell. Sums of absolute differences are more like two lines than like a parabola."""
+    """Write the results of all steps. Near their minimum sums of absolute differences are two lines, no parabola."""
     for y in range(found.mutual.shape[0]):
         for x in range(found.mutual.shape[1]):
             step, least = state.best[y, x], state.least[y, x]
@@ -296,14 +297,16 @@ def find(images: tuple[Image, Image], matches: Mapping[str, AnyArray], f: epipol
 
 
 def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
-    """Whether clearly more windows agree than would by chance, with so many steps ``tried`` in each."""
-    chance = np.average(2 * MAX_AGREE_DISTANCE_PX / tried, weights=votes)
+    """Whether more windows agree than would by chance with any plane, with so many steps ``tried`` in each."""
+    chance, share = np.average(2 * MAX_AGREE_DISTANCE_PX / tried, weights=votes), np.average(agree, weights=votes)
     # Effective number of windows: as many independent and equally distinct ones would have the same weight.
     windows = votes.sum() ** 2 / np.sum(votes**2) / WINDOW_SIDE_PX**2
-    spread = np.sqrt(chance * (1 - chance) / windows)
-    # 6.0: standard deviations by which more windows agree than by chance: of a range of 40 displacements at each of
-    # three corners there are some 10^5 different planes, and the best one is taken.
-    return bool(np.average(agree, weights=votes) >= chance + 6.0 * spread)
+    # Binomial: the chance that as large a share of as many windows, or a larger one, agrees with one plane; the normal
+    # distribution makes it far too small where windows are few.
+    tail = betainc(share * windows, (1.0 - share) * windows + 1.0, chance)
+    # 10**-5.5: of a range of 40 displacements at each of three corners there are some 10^5 different planes, and the
+    # best one is taken. Of the chosen half right planes have at most 10^-5.7, wrong ones 10^-5.2 and more.
+    return bool(tail < 10**-5.5)
 
 
 def _at_level_0(g: AnyArray, error: AnyArray) -> list[float]:

@@ -1,1 +1,1 @@
-"""From images to camera motion: interest points, tracks, key frames."""
+"""From images to camera motion: displacements, tracks, key frames, poses, loops."""

@@ -1,7 +1,7 @@
 """Sub-pixel alignment of templates under a local affinity (refinement of tracked positions, section 5.2.1).
 
-Feature vectors find *which* pixel corresponds. The grey values give the position within the pixel more exactly, once
-the template is drawn in the perspective of the searched frame. Affine Lucas-Kanade, inverse compositional: Baker and
+Feature vectors find the corresponding *pixel*. The grey values give the position within it more exactly, once the
+template is drawn in the perspective of the searched frame. Affine Lucas-Kanade, inverse compositional: Baker and
 Matthews (2004), doi:10.1023/B:VISI.0000011205.11775.fd. Grey values are compared less their mean and at equal contrast,
 so that the exposure may change from frame to frame. The affinity that the neighbouring tracks suggest is a prior, so
 that weak texture keeps to it.
@@ -34,7 +34,7 @@ class Templates(NamedTuple):
     affinity: Floats
 
     def take(self, which: NDArray[np.intp]) -> Templates:
-        """Those with these numbers."""
+        """The templates of these numbers."""
         return Templates(*(values[which] for values in self))
 
 

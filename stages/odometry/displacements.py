@@ -1,4 +1,4 @@
-"""Coarse displacements between two frames, at points, and the affinities that they show; windows about points."""
+"""Coarse displacements between two frames at points, and the affinities fitted to them; windows about points."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def known(points: Floats) -> Bools:
 
 
 def windows_at(points: Floats, half: int, *images: AnyArray) -> tuple[Bools, list[AnyArray]]:
-    """Which points (n, 2) column, row have a window inside the images (rows, cols), and each image's windows.
+    """Whether the window of each point (n, 2) column, row is inside the images (rows, cols), and each image's windows.
 
-    These are (n, side, side) of ``2 half + 1`` pixels about the nearest pixel, and anything for points without.
+    These are (n, side, side) of ``2 half + 1`` pixels about the nearest pixel; undefined for other points.
     """
     side, shape = 2 * half + 1, images[0].shape
     if min(shape) < side:
@@ -65,11 +65,11 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     if len(p) < 6 or n == 0:
         return identity, nothing
     common = common_similarity(p, q)
-    # A point that is lost gets an affinity like any other, which nobody reads.
+    # A lost point gets an affinity like any other, which is not used.
     at = np.nan_to_num(at)
     _, near = scipy.spatial.cKDTree(p).query(at, k=min(NEIGHBOURS, len(p)))
     offset = p[near] - at[:, None]
-    # What the common similarity leaves: the pull is then towards it, not towards no change.
+    # Less the common similarity: so the pull is towards it, not towards no change.
     shift = (q - p)[near] - offset @ (common - np.eye(2)).T
     count = near.shape[1]
 

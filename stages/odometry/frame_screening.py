@@ -122,7 +122,7 @@ def judge(
             continue
         for a, f, b in zip(chain[i:j], chain[i + 1 : j], chain[i + 2 :], strict=False):
             if steps[bridge] >= MIN_MATCHES or f in out.unfit:
-                shares = f"{steps[a, f]:.0%} of its pixels match the frame before, {steps[f, b]:.0%} the one behind"
+                shares = f"{steps[a, f]:.0%} of its pixels match the frame before, {steps[f, b]:.0%} the one after"
                 out.lost[f] = (
                     f"{out.unfit[f]}, {shares}" if f in out.unfit else f"not found in its neighbours: {shares}"
                 )
@@ -169,12 +169,12 @@ def _usual(values: Sequence[float | None]) -> float:
 
 
 def _neighbours(frames: Sequence[int], of: Set[int]) -> set[int]:
-    """Frames beside some others."""
+    """Frames next to some others."""
     return {n for a, b in pairwise(frames) for f, n in ((a, b), (b, a)) if f in of}
 
 
 def _doubtful_runs(good: Sequence[bool]) -> list[tuple[int, int]]:
-    """Places (i, j) of the frames before and behind each run of at least two doubtful steps between good ones."""
+    """Places (i, j) of the frames before and after each run of at least two doubtful steps between good ones."""
     runs = [(fine, list(group)) for fine, group in groupby(range(len(good)), good.__getitem__)]
     return [(steps[0], steps[-1] + 1) for fine, steps in runs if not fine and len(steps) >= 2]
 

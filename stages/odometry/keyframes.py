@@ -1,7 +1,7 @@
 """Choice of the basic pairs: which stereo pairs become elevation models (paper, sections 7.2 and 7.4).
 
 Successive basic pairs bound a *segment*: the left images from one to the next are tracked and resected against the
-elevation model of the first. Positions behind the last basic pair are an open last segment.
+elevation model of the first. Positions after the last basic pair are an open last segment.
 
 The paper takes every fourth pair of a camera that moves evenly. Here the next basic pair is the last one whose image
 still shows the wanted share of what the one before shows (:mod:`rille.stages.odometry.steps`): poses are not
@@ -122,7 +122,7 @@ def _fit(positions: Iterable[int], unfit: set[int]) -> int | None:
 
 
 def _overlap(steps: Sequence[Step]) -> float | None:
-    """Overlap of the frames before and behind some steps; None: one of them shows too little."""
+    """Overlap of the frames before and after some steps; None: one of the steps has too few matches."""
     *_, last = overlaps(steps)
     return min(last) if all(step.overlaps for step in steps) else None
 
@@ -134,7 +134,7 @@ def segments(basic: list[int], frames: int) -> list[list[int]]:
 
 
 def _warnings(overlap: Sequence[float | None], params: KeyframesParams) -> list[str]:
-    """That basic pairs have less ``overlap``, of each with the one before, than is wanted."""
+    """A line if a basic pair has less ``overlap`` with the one before than is wanted."""
     least = min((share for share in overlap if share is not None), default=1.0)
     stride = params.rule == "stride"
     # 0.4: overlap below which a stride, which asks for none, is warned of: most landmarks of a segment leave the image.

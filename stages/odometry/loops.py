@@ -1,10 +1,10 @@
 """Candidates for a place seen again: the earlier basic pairs whose left images share most words with that of a pair.
 
-A word is what a feature looks like: the signs of :data:`WORD_BITS` differences between fixed pairs of its descriptor's
-values. No vocabulary is learnt, so the words of an image depend on that image alone, and a pair that is added changes
-no earlier one. Pairs are indexed in blocks; a block reads the words of the earlier ones, some kilobytes a pair. Of
-images with binary words the similarity is their number in common over the geometric mean of their numbers (Sivic and
-Zisserman 2003, doi:10.1109/ICCV.2003.1238663, without weights).
+A word describes the look of a feature: the signs of :data:`WORD_BITS` differences between fixed pairs of its
+descriptor's values. No vocabulary is learnt, so the words of an image depend on that image alone, and a pair that is
+added changes no earlier one. Pairs are indexed in blocks; a block reads the words of the earlier ones, some kilobytes a
+pair. Of images with binary words the similarity is their number in common over the geometric mean of their numbers
+(Sivic and Zisserman 2003, doi:10.1109/ICCV.2003.1238663, without weights).
 
 Candidates only look alike: the geometry decides whether they show one place
 (:mod:`rille.stages.odometry.resection.loop`).

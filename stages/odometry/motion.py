@@ -1,11 +1,11 @@
 """Coarse displacement of all points from one left frame to the next (paper, 5.2.1, first iteration).
 
 The hierarchical matcher of stage ``hfvm``, stopped at a coarse level. There is no epipolar band: a camera that moves
-forward has radial flow, whose epipolar lines meet inside the image, where a band says nothing about the way along it.
+forward has radial flow, whose epipolar lines meet inside the image, where a band does not bound the motion along it.
 
 Where the matches are too few, or show a rotation of the image, the homography that keypoints show is undone before
 matching again (:mod:`rille.stages.hfvm.plane`): beyond ten degrees of roll upright windows match less and less, at 25
-degrees a third of the tracks is wrong. The displacements are those of the frames as they were taken all the same.
+degrees a third of the tracks is wrong. The displacements still refer to the frames as they were taken.
 """
 
 from __future__ import annotations

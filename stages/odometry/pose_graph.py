@@ -4,11 +4,10 @@ A factor measures the pose ``T_a_b`` of one node in the frame of another, with a
 some components of it alone. Errors that many factors share are unknowns of their own (``sources``), whose standard
 deviation is 1: what all segments share so adds up over a chain, and a closed loop may still correct it.
 
-Two things are not known beforehand. Which of the doubtful factors are false: those whose whitened error exceeds a
+Two things are estimated besides. First, the false ones among the doubtful factors: those whose whitened error exceeds a
 ``bound`` once the others hold, by graduated non-convexity (Yang et al. 2020, doi:10.1109/LRA.2020.2965893): first all
-count, then the cost is bent towards a truncated one. And by which factor k the chain's own errors exceed their
-covariances: it is the least under which most factors agree, and their errors are as large as stated. Smaller than 1 it
-is never.
+count, then the cost is bent towards a truncated one. Second, the factor k >= 1 by which the chain's own errors exceed
+their covariances: the least with which most factors agree, and their errors are as large as stated.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ EXCESS = (1.0, 2.0, 5.0, 10.0, 30.0)
 MAJORITY = 0.7
 """Share of the doubtful factors that have to agree."""
 MAX_ROUNDS, GRADUATION = 40, 2.0
-"""Of graduated non-convexity, and the factor by which it is undone from round to round."""
+"""Rounds of graduated non-convexity, and the factor that brings each nearer to the truncated cost."""
 STEPS, FEW_STEPS = 30, 3
 """Steps of a whole adjustment, and of one round."""
 
@@ -70,7 +69,7 @@ class Factors:
 
     @staticmethod
     def joined(parts: Sequence[Factors]) -> Factors:
-        """All of them, the sources of each part being its own."""
+        """All factors of some parts, each part with sources of its own."""
         names, width = ("ends", "poses", "root", "lever", "bound"), sum(part.shared.shape[2] for part in parts)
         shared, column = [], 0
         for part in parts:
@@ -80,11 +79,11 @@ class Factors:
         return Factors(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names}, shared=np.vstack(shared))
 
     def beside(self, others: Factors) -> Factors:
-        """These and others with the same sources."""
+        """These factors and others with the same sources."""
         return Factors(**{name: np.concatenate([value, getattr(others, name)]) for name, value in vars(self).items()})
 
     def take(self, chosen: NDArray[np.intp]) -> Factors:
-        """Those with these numbers."""
+        """The factors of these numbers."""
         return Factors(**{name: value[chosen] for name, value in vars(self).items()})
 
     @property
@@ -134,12 +133,12 @@ class PoseGraph:
 
     @property
     def unknowns(self) -> int:
-        """Of poses and sources."""
+        """Number of unknowns, of poses and sources."""
         return 6 * (self.nodes - 1) + int(self.factors.shared.shape[2])
 
     @cached_property
     def _scale(self) -> Floats:
-        """On whitened errors (m,): the chain's are those of k times the sigma."""
+        """Factor (m,) on whitened errors: those of the chain are divided by k."""
         return np.asarray(np.where(self.factors.doubtful, np.sqrt(self.weight), 1.0 / self.excess))
 
     @cached_property
@@ -160,7 +159,7 @@ class PoseGraph:
         return np.asarray(np.einsum("mij,mj->mi", self.factors.root, off))
 
     def _difference(self, state: GraphState) -> tuple[Floats, Floats, Floats]:
-        """Errors (m, 6) in the frame of a, sources and all; in the world ways (m, 3) from a to b, and levers."""
+        """Errors (m, 6) in the frame of a, with sources; in the world displacements (m, 3) from a to b, and levers."""
         f = self.factors
         a, b = f.ends.T
         back, lever = np.swapaxes(state.R[a], 1, 2), np.einsum("mij,mj->mi", state.R[b], f.lever)
@@ -239,9 +238,9 @@ class Adjusted(NamedTuple):
 
 
 def adjust(graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS) -> Adjusted:
-    """The graph adjusted without the factors that contradict, with the least of the excesses that explains the others.
+    """The graph adjusted without the contradicting factors, with the least of the excesses that explains the others.
 
-    Where none does, the chain is as exact as it says and all that contradict are left out.
+    If none does, the chain is as exact as stated, and all contradicting factors are left out.
     """
     tried = list[Adjusted]()
     for k in excesses:

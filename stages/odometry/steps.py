@@ -118,7 +118,7 @@ class Overlap(NamedTuple):
 
 
 def overlaps(steps: Sequence[Step]) -> Iterator[Overlap]:
-    """Overlap of the frame before the first step with that behind each of the steps."""
+    """Overlap of the frame before the first step with that after each of the steps."""
     if not steps:
         return
     origin = points = steps[0].blocks

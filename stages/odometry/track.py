@@ -1,7 +1,7 @@
 """Tracking of interest points through the left frames of a segment (section 5.2.1).
 
 Source: Kolesnik, Paar, Bauer, Ulm (1999), section 5.2.1. The first iteration is the paper's: coarse displacements of
-all pixels between successive frames (stage ``motion``) predict where an interest point went. In place of the second
+all pixels between successive frames (stage ``motion``) predict the place of an interest point. In place of the second
 one, a search by feature vectors, the affinity by which the surroundings of a point changed is fitted to the
 displacements of its neighbours, and the template of the frame in which the point was *born* is aligned under it, there
 and back (:mod:`rille.stages.odometry.affine_lk`). Errors do not accumulate along the chain, since each frame is
@@ -57,7 +57,7 @@ class TrackParams(Params):
 @dataclass
 class Tracks:
     """``points`` (n, frames, 2) column, row, NaN lost; ``birth`` (n,) index of the frame that the template is from;
-    ``expected`` (n, 2) where each point is thought to be in the last frame that was searched."""
+    ``expected`` (n, 2) predicted place of each point in the last frame that was searched."""
 
     points: Floats
     birth: NDArray[np.int16]
@@ -71,7 +71,7 @@ class Tracks:
         return state
 
     def and_also(self, other: Tracks, keep: Bools) -> Tracks:
-        """These, and those of the others (n,) that are kept."""
+        """These tracks, and those of the others (n,) that are kept."""
         return Tracks(*(np.concatenate([mine, vars(other)[name][keep]]) for name, mine in vars(self).items()))
 
 

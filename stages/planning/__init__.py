@@ -1,1 +1,1 @@
-"""Paths over a risk map: the row graph of the paper."""
+"""Paths over a risk map, and the local planner of a drive."""

@@ -89,7 +89,7 @@ class FreePlaces:
 
 
 def widened(mask: Bools, half_length: float, half_width: float, step: tuple[int, int]) -> Bools:
-    """Cells from which a rectangle, cells, aligned with ``step`` (row, col), touches the mask or leaves the map."""
+    """Cells from which a rectangle, in cells, aligned with ``step`` (row, col), touches the mask or leaves the map."""
     # A size that is a whole number of steps may come out a rounding above it, and must not grow by a step.
     along, across = (max(0, math.ceil(v / math.hypot(*step) - 1e-9)) for v in (half_length, half_width))
     lines = [_line(along, *step), _line(across, step[1], -step[0])]

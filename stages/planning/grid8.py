@@ -49,15 +49,15 @@ def _search(terrain, first, last, cost, step):  # type: ignore[no-untyped-def]
             if i < 0 or j < 0 or i >= rows or j >= cols or not ways[r, c] & ways[i, j] & way:
                 continue
             total = key + terrain.lengths[k] + abs(height[r, c] - height[i, j]) + toll[i, j]
-            # Not at equal cost: what was reached first stays, so that ties do not hang on the heap's layout.
+            # Not at equal cost: the first step stays, so that ties do not depend on the heap's layout.
             if total < cost[i, j]:
                 cost[i, j], step[i, j] = total, k
                 heappush(heap, (total, i * cols + j))
 
 
 def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:
-    """Ground that is connected by edges: its number of every cell (row, col), -1 where the vehicle may not stand; and
-    the first and the last row of each (number, 2), in reading order of their first cells."""
+    """Parts of ground that edges connect: the part of each cell (row, col), -1 where the vehicle may not stand; and the
+    first and the last row of each (number, 2), in reading order of their first cells."""
     number = np.full(ways.shape, -1, dtype=np.int32)
     # At most one a cell; memory that is not written is not taken.
     spans = np.empty((ways.size, 2), dtype=np.int64)

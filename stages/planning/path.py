@@ -6,7 +6,7 @@ reaches what lies beside or behind an obstacle (:mod:`rille.stages.planning.grid
 second where the first reaches no target that was asked for.
 
 The weight of an edge is the absolute height difference between the places where a wheel would stand: means over the
-wheel's window, rounded to a step that means nothing to the vehicle. ``grid8`` adds the length, since without rows to
+wheel's window, rounded to a step that does not matter to the vehicle. ``grid8`` adds the length, since without rows to
 cross a path of no climb could be of any length; ``rows`` a part of what a diagonal is longer (``detour_cost``), else a
 path over level ground would follow the noise of its elevations. Caution ground costs a toll.
 
@@ -86,9 +86,9 @@ WORST = {
     "least_clearance": ("clearance", np.nanmin),
     "max_p_hazard": ("p_hazard", np.nanmax),
 }
-"""Facts of a path by the map that they are the worst of."""
+"""Facts of a path that are the worst values of a map along it."""
 ENDS = ("the edge of the map", "unknown ground", "ground too uncertain to be called safe", "a hazard")
-"""What a path does not go beyond."""
+"""What ends a path."""
 
 
 def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certain: float) -> str:
@@ -110,7 +110,7 @@ def ending(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle, p_certa
 
 
 def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> dict[str, Any]:
-    """Facts of a route: length, climb, and the worst that it meets."""
+    """Facts of a route: length, climb, and the worst values along it."""
     xyz, row = route.xyz, route.blocking_row
     meta: dict[str, Any] = {
         "found": len(xyz) > 0,
@@ -142,7 +142,7 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
 
 
 def _why(reason: str, maps: Maps, vehicle: Vehicle) -> str:
-    """Why there is no path; where hazards leave nothing to drive on, the limit that does the most."""
+    """Why there is no path; if hazards leave no ground to drive on, the limit that closes most."""
     risk = maps["risk"]
     judged = int((risk != UNKNOWN).sum())
     # Where something is free, the search's own reason says more than a count of hazards.

@@ -87,7 +87,7 @@ def cell_of(lattice: Lattice, point: Sequence[float] | Floats) -> Cell:
 
 
 def cell_within(lattice: Lattice, name: str, point: Sequence[float]) -> Cell:
-    """The same of a point called ``name``, which is refused outside of the lattice."""
+    """The same; a point, called ``name``, outside of the lattice is refused."""
     row, col = cell_of(lattice, point)
     if not (0 <= row < lattice.rows and 0 <= col < lattice.cols):
         x0, x1, y0, y1 = lattice.bounds
@@ -135,7 +135,7 @@ class PathMaps:
         self._parts: dict[str, tuple[NDArray[np.int32], Ints]] = {}
 
     def ways(self, below: str) -> Bytes:
-        """Directions (row, col) as bits with ``below``, one of :data:`GROUNDS`, on the known."""
+        """Directions (row, col), as bits, in which it may stand with ``below`` (:data:`GROUNDS`) on known ground."""
         if below not in self._ways:
             self._ways[below] = self._places.ways(below)
         return self._ways[below]

@@ -40,7 +40,7 @@ class HeightGrid:
 
     @staticmethod
     def of(height: NDArray[np.floating], x0: float, y0: float, cell: float, wheel_diameter: float) -> HeightGrid:
-        """Ground with what a wheel makes of it."""
+        """Heights with the resting places of a wheel and its steps."""
         z = np.asarray(height, dtype=np.float64)
         radius = 0.5 * wheel_diameter
         n = int(radius / cell)
@@ -142,7 +142,7 @@ def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle:
     plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]
     # The wheels stand at a mean height of ``middle``: least squares through four corners of a rectangle are its means.
     free = plane + vehicle.clearance - at(ground.height, belly)
-    # A point of the belly over unknown ground says nothing; only a vehicle over nothing known has no clearance.
+    # A point of the belly over unknown ground does not count; over unknown ground alone there is no clearance.
     clearance = np.where(np.isnan(free), np.inf, free).min(axis=1)
     clearance = np.where(np.isfinite(middle) & np.isfinite(clearance), clearance, np.nan)
     return Measures(middle, rise, lean, np.arctan(np.hypot(lean, rise)), clearance, at(ground.step, wheels).max(axis=1))

@@ -1,1 +1,1 @@
-"""Elevation models: the ground frame, merging, checks of overlaps, shading."""
+"""Elevation models: ground frame, Locus, merge, checks of overlaps, place in a map, shading."""

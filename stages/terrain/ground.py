@@ -5,7 +5,7 @@ The inverse depth 1/Z of a plane n . X = -h (camera frame, n up, h the camera's 
 plane is a linear fit with uniform noise ("v-disparity" and its kin, Labayrade et al. 2002,
 doi:10.1109/IVS.2002.1188024), for any rig: the inverse depth comes from the projection on the local epipolar line.
 
-Any plane of the scene is fitted alike: which one is the ground, its normal says.
+Any plane of the scene is fitted alike; its normal decides whether it may be the ground.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class NoGroundError(DegenerateError):
 
 
 class CoarseGroundError(NoGroundError):
-    """The disparity shows ground, and not well enough for cells of the size that is wanted."""
+    """The disparity shows ground, but not well enough for cells of the wanted size."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Samples(NamedTuple):
     focal: float
 
     def take(self, which: Bools) -> Samples:
-        """Some of them."""
+        """The chosen points."""
         return self._replace(rays=self.rays[which], rho=self.rho[which], sigma=self.sigma[which])
 
 
@@ -108,7 +108,7 @@ MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with 
 
 
 def _consensus(samples: Samples, tolerance: Floats, allowed: Callable[[Floats], Bools]) -> Floats | None:
-    """The allowed plane of most agreement among planes through three points; None: none is allowed."""
+    """The allowed plane through three points that most points agree with; None: none is allowed."""
     rays, rho, sigma = samples.rays, samples.rho, samples.sigma
     # An all-ground sample of three is among a thousand (p > .999) where a fifth of the pixels are ground.
     triples = np.random.default_rng(1999).integers(0, rays.shape[0], size=(1000, 3))
@@ -151,7 +151,7 @@ class PlaneView:
 
     def cell_size(self) -> float:
         """Pixel footprint (geometric mean of both directions) at twice the nearest distance, to 1, 2 or 5."""
-        # Farther pixels cover more: by them the near ground would be drawn coarser than it is seen.
+        # Farther pixels cover more, and would make cells too coarse for the near ground.
         near = self.slant <= 2.0 * self.slant.min()
         return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
 

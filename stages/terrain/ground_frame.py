@@ -1,9 +1,9 @@
 """Vertical and reference plane of one basic pair: its local frame, without any pose of another frame.
 
 The local frame of a basic pair has its origin at the left camera's centre, z up, y along the horizontal projection of
-the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). Where "up" is comes from the
-best source at hand: a measured attitude, the rig's stated pitch, else the ground plane that the
-disparity shows. The ground plane is fitted in any case: it gives the range of elevations that Locus searches.
+the optical axis (paper, sections 3.2 and 4.7: the local path is planned heading-aligned). The vertical comes from the
+best source at hand: a measured attitude, the rig's stated pitch, else the ground plane that the disparity shows. The
+ground plane is fitted in any case: it gives the range of elevations that Locus searches.
 
 A trajectory needs neither. Where no ground is seen (unless ``reference_height`` states it) and nothing gives the
 vertical either, the local frame is that of the camera: its own up is z.
@@ -118,7 +118,8 @@ def level(
         R_local_left = level_rotation(ground.up if known_up is None else known_up)
         return _on_ground(ground, R_local_left, samples, rig, source or GROUND_PLANE)
     except DegenerateError as error:
-        why, other = _explained(error, samples, ground)
+        below = _matched_below(matches, rig, UPRIGHT if known_up is None else known_up)
+        why, other = _explained(error, samples, ground, below)
     up = UPRIGHT if known_up is None else known_up
     # No ground is seen: odometry, which needs none, still gets a frame.
     source, R_local_left = source or NO_VERTICAL, level_rotation(up)
@@ -158,15 +159,26 @@ def _hangs(samples: Samples, up: Floats) -> bool:
     with suppress(DegenerateError):
         # cos 45 degrees: beyond, cameras look at the plane rather than along it, as backwards down from a drone.
         plane = fit_plane(samples, lambda n: np.asarray(n @ up <= -0.7))
-        return plane.inliers >= MIN_REFERENCE_SHARE or plane.reach >= MIN_REACH_HEIGHTS
+        # 0.1: of the matches; crowns and eaves of a street make far planes above the cameras that hold 0.05 to 0.07.
+        far = plane.reach >= MIN_REACH_HEIGHTS and plane.inliers >= 0.1
+        return plane.inliers >= MIN_REFERENCE_SHARE or far
     return False
 
 
+def _matched_below(matches: Matches, rig: Rig, up: Floats) -> float:
+    """Share of matched pixels in the lowest quarter of the left image, where ground is seen first."""
+    usable = matches.usable[::4, ::4]
+    row, col = 4.0 * np.indices(usable.shape).reshape(2, -1)
+    rays = rig.left.rays(np.stack([col, row], axis=-1))
+    height = rays @ up / np.linalg.norm(rays, axis=1)
+    return float(usable.ravel()[height <= np.quantile(height, 0.25)].mean())
+
+
 def _explained(
-    error: DegenerateError, samples: Samples, ground: GroundPlane | None
+    error: DegenerateError, samples: Samples, ground: GroundPlane | None, below: float
 ) -> tuple[DegenerateError, GroundPlane | None]:
     """Why there is no ground, or none that is seen well enough, with the remedy of that cause; and the other plane that
-    dominates, None where none does."""
+    dominates, None where none does. ``below``: share of matched pixels where ground is seen first."""
     if not isinstance(error, NoGroundError) or (ground is not None and ground.inliers >= MIN_DOMINANT_SHARE):
         return error, None
     try:
@@ -174,8 +186,12 @@ def _explained(
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
+        message = error.message
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        return DegenerateError(error.code, error.message, remedy=remedy), None
+        if below < 0.5:
+            message += f"; {below:.0%} of the lowest quarter of the left image is matched"
+            remedy = f"look there at both images (dirt or drops on a lens, a torn part, glare, no texture); {remedy}"
+        return DegenerateError(error.code, message, remedy=remedy), None
     up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
     message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
     remedy = "if that is the ground, state it as world.up in a manifest"
@@ -183,7 +199,7 @@ def _explained(
 
 
 def _on_ground(ground: GroundPlane, R_local_left: Floats, samples: Samples, rig: Rig, source: str) -> GroundFacts:
-    """What :func:`level` says of a pair whose ground plane is known."""
+    """Result of :func:`level` for a pair whose ground plane is known."""
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
@@ -213,7 +229,7 @@ def scene_plane(samples: Samples) -> GroundPlane:
         raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
-        # What is seen along a plane makes no map.
+        # A plane that is seen along itself makes no map.
         plane = fit_plane(samples, lambda n: np.asarray(-n @ view >= math.cos(math.radians(65.0))))
         if plane.inliers >= MIN_DOMINANT_SHARE:
             return plane
@@ -236,7 +252,7 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
 
 
 def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
-    """What :func:`level` says of a pair whose reference plane is no ground."""
+    """Result of :func:`level` for a pair whose reference plane is no ground."""
     z = reference.up
     # Along the plane, right in the image; for a plane that holds that direction's normal alone, along the optical axis.
     right = np.eye(3)[0 if abs(z[0]) < 0.9 else 2]
@@ -263,8 +279,8 @@ def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
 
 
 def _cell_without_ground(rho: Floats, rig: Rig) -> float:
-    """Cell size, m, by what is seen instead, inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
-    # Where nothing is seen at all, 20 baselines stand for the distance.
+    """Cell size, m, from inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
+    # Without any match, 20 baselines stand for the distance.
     # A twentieth of the points may be nearer than the nearest distance: gross mismatches.
     near = 1.0 / float(np.quantile(rho, 0.95)) if rho.size else 20.0 * rig.baseline
     return rounded_cell(2.0 * near / coarser_focal(rig))

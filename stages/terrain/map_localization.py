@@ -1,4 +1,4 @@
-"""Where an elevation model lies in a coarser map: by their relief, without a start that is near.
+"""Place of an elevation model in a coarser map, found by relief without a start near it.
 
 The model is level, or nearly so: x, y, z, heading and a small tilt place it. It is averaged over blocks as wide as the
 map's cells, for single cells would differ from the map by their relief and not by a wrong place.
@@ -15,8 +15,7 @@ map's cells, for single cells would differ from the map by their relief and not 
    is worse than the best one is this number times the logarithm of the ratio of their mean squares, so that no standard
    deviation of the map has to be known.
 
-The given surroundings bound the answer and decide nothing else: the search reaches farther, so that a better place
-beside them is no secret."""
+The given surroundings only bound the answer: the search reaches farther, and names a better place beside them."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ from rille.stages.terrain.shading import gradient
 MIN_CELLS = 30
 """Cells of the map that the model must cover."""
 MAX_TRIES, MAX_TRIES_AT_ALL = 3e6, 2e8
-"""Headings times cells: above, a coarser version is searched where there is one; and what is refused."""
+"""Headings times cells: beyond the first a coarser version is searched, if there is one; beyond the second none is."""
 NEIGHBOURS = 3
 """Steps of the search, within which a place is a neighbour: it belongs to the same valley."""
 MIN_CHI2_GAP = 30.0
@@ -67,8 +66,8 @@ class MapLocalizationParams(Params):
 
 @dataclass(frozen=True)
 class SearchArea:
-    """What is searched: origins of the model within ``distance`` of x, y, m, and headings (to the left) within ``turn``
-    of ``heading``, rad."""
+    """Searched origins of the model, within ``distance`` of x, y, m, and headings (to the left) within ``turn`` of
+    ``heading``, rad."""
 
     x: float
     y: float
@@ -132,7 +131,7 @@ def thin(model: Grid, cell: float) -> ModelBlocks:
 
 
 def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocalizationParams) -> Placement:
-    """Place a level model on a map, both of elevations, m; where nothing is named, anywhere.
+    """Place a level model on a map, both of elevations, m; without a search area, anywhere.
 
     Raises
     ------
@@ -197,7 +196,7 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
 
 
 def _tries(ground: Grid, far: float, around: SearchArea) -> float:
-    """Headings and cells of a search, with those that correlations add."""
+    """Number of headings times cells of a search, with those that correlations add."""
     edge = 2.0 * far / ground.cell
     rows, cols = ground.values.shape
     return float((2.0 * around.turn * far / ground.cell + 1.0) * (rows + edge) * (cols + edge))
@@ -307,7 +306,7 @@ def _placed(best: HeightFit, blocks: ModelBlocks, sigma_tilt: float) -> Placemen
 
 
 def _against(placed: Placement, best: HeightFit, other: HeightFit) -> Placement:
-    """The same with the next best place beside it, and with a doubt where that fits nearly as well."""
+    """The placement with the next best place, and with a doubt if that fits nearly as well."""
     chi2 = placed.figures["independent"] * math.log(max(other.square, 1e-24) / max(best.square, 1e-24))
     (x, y, _), (ox, oy, _), doubt = best.pose.translation, other.pose.translation, placed.doubt
     if not doubt and chi2 < MIN_CHI2_GAP:

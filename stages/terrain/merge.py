@@ -7,11 +7,12 @@ deviation and r its residual, a model's weight is
 
 Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
 
-The standard deviation of the result has four parts. Each model's own, independent of the others'; what the models
-have in common, since they saw the same light and the same shapes (``alike`` is the correlation of two models' errors);
-that of the poses; and that of a rig that was repaired. With s_i the shares of the weights, p_i what the covariance of
-model i's pose says of the height there (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)), r the standard deviation
-of the error that all inverse depths share, h_i and d_i the height of camera i above the cell and the cell's depth,
+The standard deviation of the result has four parts. Each model's own, independent of the others'; what the models have
+in common, since they saw the same light and the same shapes (``alike`` is the correlation of two models' errors); that
+of the poses; and that of a rig that was repaired. With s_i the shares of the weights, p_i the standard deviation of the
+height there by the covariance of model i's pose (dz = dC_z + dtheta_x (y - C_y) - dtheta_y (x - C_x)), r the standard
+deviation of the error that all inverse depths share, h_i and d_i the height of camera i above the cell and the cell's
+depth,
 
     sigma^2 = (1 - alike) sum (s_i sigma_i)^2 + alike (sum s_i sigma_i)^2 + (sum s_i p_i)^2 + (sum s_i h_i d_i r)^2
 
@@ -21,8 +22,8 @@ common, so that their errors, as the rig's, neither average out over the models 
 and steps are judged by.
 
 Sums run over the models in the order of their pairs, in double precision, so equal input gives equal bits wherever a
-tile or a strip begins. A tile is merged in strips of lines, of each model only the strip is read: what is in memory at
-once is bounded by :data:`STRIP_BYTES`, however many models meet and however large they are.
+tile or a strip begins. A tile is merged in strips of lines, and of each model only the strip is read, so that
+:data:`STRIP_BYTES` bounds the memory, however many and large the models are.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def merge_cells(
         undefined, on the cells of ``strip``.
     layers : (n,) those models.
     errors : that the models share.
-    worst : greatest standard deviation but for the poses, m.
+    worst : greatest standard deviation without the poses' part, m.
     """
     z, sigma, residual, ortho = maps.astype(np.float64)
     # A residual as large as the error of a good disparity halves a model's weight.
@@ -291,7 +292,7 @@ def _read(layers: Sequence[ModelLayer], strip: Lattice) -> Floats32:
 def seen_finely(elevation: Floats32, x: Floats, y: Floats, facts: Mapping[str, Any], most: float | None) -> Floats32:
     """Elevations (row, col), m, but NaN where a pixel covers more than ``most`` metres, see :func:`footprint`.
 
-    ``facts`` are those of the model; one that no image shows (``pixel_rad``) is vouched for.
+    ``facts`` are those of the model; one without ``pixel_rad``, which is no image's, is kept whole.
     """
     if most is None or "pixel_rad" not in facts:
         return elevation

@@ -70,7 +70,7 @@ def ceiling(elevation: Floats32, lattice: Lattice, centre: Floats) -> Floats32:
 
 @njit(cache=True, nogil=True)
 def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
-    """From each known cell towards the camera, until what is known again."""
+    """Go from each known cell towards the camera, up to the next known one."""
     rows, cols = z.shape
     for r in range(rows):
         for c in range(cols):

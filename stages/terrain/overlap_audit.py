@@ -29,7 +29,7 @@ def stands_out(seam: Facts) -> bool:
 
 
 def audit(seams: Sequence[Facts]) -> list[dict[str, Any]]:
-    """Each model against its neighbours, the worst first.
+    """Comparison of each model with its neighbours, the worst first.
 
     Parameters
     ----------

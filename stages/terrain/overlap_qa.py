@@ -1,8 +1,8 @@
-"""Overlap of two elevation models: what of their difference is systematic, and what is noise, with an honest sigma.
+"""Systematic part and noise of the difference of two elevation models where they overlap.
 
 The difference of a model from each earlier one that saw the same ground has three parts: a bias and a tilt about two
-axes, which come from the poses (or the rig); and noise, which comes from the matching and is compared with what both
-models' own standard deviations let expect. The factor between both models' grey values is a by-product
+axes, which come from the poses (or the rig); and noise, which comes from the matching and is compared with both
+models' own standard deviations. The factor between both models' grey values is a by-product
 (:mod:`rille.stages.terrain.radiometry`).
 
 Large overlaps are thinned to every n-th cell. Bias and tilt are those of a robust plane through the differences, which

@@ -26,8 +26,8 @@ from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig
 
 MIN_DEPTH_SIGMAS = 3.0
-"""An inverse depth that is not this many of its standard deviations above 0 may as well be infinitely far; what is as
-many below 0 is no noise."""
+"""An inverse depth less than so many of its standard deviations above 0 may be that of an infinitely far point; one as
+many below 0 is a wrong match."""
 
 MAX_CUBES = 1_000_000
 """Cubes to either side of the origin."""
@@ -67,7 +67,7 @@ def points(disparity: Bundle, rig: Rig, every: int = 1) -> PairPoints:
     Parameters
     ----------
     disparity : result of stage ``hfvm``; interpolated pixels are no measurements and give no point.
-    every : each so many-th row and column alone.
+    every : take each n-th row and column alone.
     """
     thin = np.s_[::every, ::every]
     std = np.asarray(disparity["disparity_std"])[thin]

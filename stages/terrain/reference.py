@@ -1,4 +1,4 @@
-"""Whether a run's elevations are heights above ground or distances from the scene's own plane, by what its pairs show.
+"""Whether a run's elevations are heights above ground or distances from the scene's own plane, by its pairs.
 
 Many scenes hold a level plane that is no ground: a floor under shelves, a table. A pair shows *ground* if
 

@@ -1,4 +1,4 @@
-"""Which tiles of the world an elevation model touches: known only once its pose is, and small enough to plan by.
+"""World tiles that an elevation model touches: known once its pose is, and small enough to lay out tasks by.
 
 The world is cut once for all models, at multiples of a number of cells of the infinite lattice: tile (tx, ty) holds the
 columns ``tx * side .. (tx + 1) * side`` and the lines ``-y / cell`` of ``ty * side .. (ty + 1) * side``. A tile is the

@@ -202,6 +202,33 @@ def test_what_is_wrong_is_one_line_with_a_remedy(flight, spoil, expected):
     assert caught.value.remedy
 
 
+def test_a_damaged_sensor_is_no_reason_to_give_the_recording_up(flight):
+    record = flight / "mav0" / "imu0" / "data.csv"
+    lines = record.read_text().splitlines()
+    record.write_text("\n".join([*lines[:9], *lines[8:]]))
+    with raises("RIL-293", "line 10", f"or rename {record.parent}"):
+        opened(flight)
+    record.parent.rename(record.parent.with_name("imu0.damaged"))
+    assert opened(flight).frames == FRAMES
+
+
+def test_positions_of_a_laser_tracker_are_a_truth(flight):
+    """EuRoC's ``leica0``: positions of a prism that its ``T_BS`` places in the body."""
+    m = flight / "mav0"
+    (m / "state_groundtruth_estimate0").rename(m / "other")
+    prism = [body(k * STEP / 1e9) @ T_BODY_MARKER for k in range(FRAMES)]
+    rows = [f"{START + k * STEP},{','.join(map(repr, T.translation.tolist()))}" for k, T in enumerate(prism)]
+    write(m / "leica0" / "sensor.yaml", sensor(T_BODY_MARKER, camera=False))
+    write(
+        m / "leica0" / "data.csv", "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]\n" + "\n".join(rows) + "\n"
+    )
+    truth = opened(flight).truth_positions
+    for k, T in enumerate(prism):
+        left = body(k * STEP / 1e9) @ T_BODY_LEFT
+        np.testing.assert_allclose(left.apply(np.array(truth.lever_arm)), T.translation, atol=1e-9)
+        np.testing.assert_allclose(truth.positions[k], T.translation)
+
+
 # -- a real drone, at rest ---------------------------------------------------------------------------------------------
 
 

@@ -161,7 +161,9 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
     [
         (["1 0 0 0 0 1 0 0 0 0 1 0"] * 2, "truth"),
         (["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"] * 2, "truth"),
+        (["0.1 0.6 0.8 0 9 -0.8 0.6 0 8 0 0 1 7"] * 2, "truth"),
         (["700 0 30 0 0 700 20 0 0 0 1 0"] * 2, ""),
+        (["t,ax,ay,az,gx,gy,gz", "140,0,0,9.8,0.1,-3.6,0"], "imu"),
         (["# time x y z qx qy qz qw", "0.1 0 0 0 0 0 0.6 0.8"], "truth"),
         (["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z", "1403,0.9,2.2,0.9,0.8,0.6,0.0,0.0,0.1,0.2"], "truth"),
         (["#timestamp [ns],w_RS_S_x [rad s^-1],y,z,a,b,c", "140,0,0,0,9.8,0.1,-3.6"], "imu"),
@@ -178,6 +180,18 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
 def test_tables_are_told_by_content(tmp_path, lines, kind):
     write_lines(tmp_path / "table.txt", lines)
     assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+def test_positions_of_rtklib_are_found(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    row = "2020/09/13 12:26:4{}.0 1 2 3 1 9"
+    head = "%  GPST  e-baseline(m) n-baseline(m) u-baseline(m) Q ns"
+    write_lines(tmp_path / "gnss.pos", ["% program : RTKPOST", head, row.format(0), row.format(1)])
+    found = inspect(tmp_path)
+    assert found.tables == {"positions": ["gnss.pos"]}
+    assert '[positions]  # optional: GNSS; the trajectory is adjusted to it\n# file = "gnss.pos"' in manifest_text(
+        found, "."
+    )
 
 
 def test_true_positions_that_cannot_be_read_are_told(tmp_path):

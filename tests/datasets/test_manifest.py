@@ -507,6 +507,13 @@ def test_unit_and_lever_arm_of_the_truth(tmp_path):
     assert found.to_dict()["lever_arm"] == (0.1, -0.2, 0.3)
 
 
+def test_poses_that_are_numbered_by_frame_belong_to_the_numbers_in_the_names(tmp_path):
+    """Rows of a frame's number and a 3 x 4 matrix, as KITTI-360 has them."""
+    write_lines(tmp_path / "p.txt", [f"{k} 1 0 0 {k}.5 0 1 0 0 0 0 1 0" for k in (0, 2)])
+    path = write_sequence(tmp_path, '[times]\nnames = true\nunit = "s"\n[truth]\nfile = "p.txt"\n')
+    assert [pose and pose.translation[0] for pose in opened(path).truth] == [0.5, None, 2.5]
+
+
 def test_true_positions_are_those_of_the_body_that_the_camera_stands_in(tmp_path):
     write_lines(tmp_path / "p.csv", ["time,x,y", "0,1,2", "0.1,2,3", "0.2,3,4"])
     mount = "T_body_left = [[0,0,1,2],[-1,0,0,0],[0,-1,0,0.5]]\n"
@@ -542,7 +549,7 @@ def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
             ["frame time,qw,qx,qy,qz", "7,1,0,0,0"],
             ("RIL-230", "frame time", "is called time"),
         ),
-        ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti")),
+        ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti", "numbers of frames")),
         ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-138", "nothing.txt")),
     ],
 )

@@ -98,6 +98,15 @@ def test_noise_that_keeps_its_place_is_told_from_scenes_that_move_or_rest(tmp_pa
     assert "left images" in line
 
 
+def test_hot_pixels_in_the_dark_are_told_from_a_camera_that_stands():
+    random = np.random.default_rng(5)
+    scene = cv2.GaussianBlur(random.random((160, 300)).astype(np.float32), (0, 0), 1.5) * 60
+    moving = [scene[:, 20 * k : 20 * k + 192] + random.normal(0, 2, (160, 192)) for k in range(3)]
+    hot = random.random((160, 192)) < 0.004
+    assert fixed_pattern([np.where(hot, 255, image) for image in moving]) > 0.4
+    assert fixed_pattern([np.where(hot, 255, moving[0] + random.normal(0, 1, hot.shape)) for _ in range(3)]) < 0.05
+
+
 def turned(folder, tags, ending="jpg"):
     path = write_sequence(folder, frames=2)
     path.write_text(path.read_text().replace(".png", f".{ending}"))

@@ -77,6 +77,8 @@ def ignore_settings() -> None:
     """
     if not any(isinstance(finder, _Elsewhere) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Elsewhere())
+    if not os.access(os.path.expanduser("~"), os.W_OK):  # of a service; matplotlib would complain in each process
+        os.environ.setdefault("MPLCONFIGDIR", str(private_folder() / "matplotlib"))
 
 
 def _execute_elsewhere(execute: Callable[[ModuleType], None], module: ModuleType) -> None:

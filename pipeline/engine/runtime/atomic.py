@@ -10,7 +10,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 LEFTOVER = ".tmp-"
@@ -32,7 +32,8 @@ def replacing(path: Path) -> Iterator[Path]:
     apart = _beside(path)
     # A folder of its own: writers that choose the format by the file name see the final name, and files that they put
     # beside it (GDAL does) are removed with the folder.
-    apart.mkdir()
+    with named(path):
+        apart.mkdir()
     try:
         with named(path):
             yield apart / path.name
@@ -64,7 +65,6 @@ def write(path: Path, data: bytes | str) -> None:
 
 def create(path: Path, content: bytes | memoryview) -> bool:
     """Write a file unless there is one, and flush it to the disk before it can be seen; whether it was written."""
-    above = [] if path.parent.exists() else list(path.parents)[1:4]
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _beside(path)
     try:
@@ -80,15 +80,8 @@ def create(path: Path, content: bytes | memoryview) -> bool:
             return False
     finally:
         temporary.unlink(missing_ok=True)
-    # The new name is an entry of its folder, and a new folder is one of the folder above: each needs a flush. The file
-    # is there in any case: at worst a power failure takes it back as a whole.
-    with suppress(OSError):
-        for folder in [path.parent, *above]:
-            handle = os.open(folder, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+    # Folders are not flushed, which takes as long again: a power failure may take back the last artifacts, each as a
+    # whole, and they are computed again.
     return True
 
 
@@ -112,11 +105,12 @@ def remove(path: Path, modified: float) -> None:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Name the file in errors of a block; that of a write to a full disk has no name."""
+    """Name the file in errors of a block: that of a write to a full disk has no name, others that of a leftover."""
     try:
         yield
     except OSError as error:
-        error.filename = error.filename or str(path)
+        if not error.filename or LEFTOVER in str(error.filename):
+            error.filename = str(path)
         raise
 
 

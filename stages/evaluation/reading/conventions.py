@@ -135,7 +135,7 @@ def _jumps(P: Floats, Q: Floats, sigma: float) -> list[str]:
     if not len(jumps) or _misfit(P, steady) > MAX_SHARE * _misfit(P, Q):
         return []
     text = (
-        f"behind {jumps[0] + 1} of its {len(Q)} poses, usually by {np.median(off):.2g} m: correct or remove poses there"
+        f"after {jumps[0] + 1} of its {len(Q)} poses, usually by {np.median(off):.2g} m: correct or remove poses there"
     )
     return [
         f"the truth jumps by {off[jumps[0]]:.3g} m against the trajectory {text}, unless it is the trajectory's error"

@@ -31,15 +31,15 @@ class Map(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Displacements of the left pixels, ``v << 16 | u``, and what each costs without smoothness; (row, col) int32."""
+    """Displacements of the left pixels, ``v << 16 | u``, and their costs without smoothness; (row, col) int32."""
 
     shift: AnyArray
     cost: AnyArray
 
 
 class Smoothing(NamedTuple):
-    """Propagation: cost of a step of roughness, number of rounds, and what beside a displacement is tried: nothing (0),
-    a column to either side (1), a row too (2)."""
+    """Propagation: cost of a step of roughness, number of rounds, and the neighbours of a displacement that are tried:
+    none (0), a column to either side (1), a row too (2)."""
 
     smoothness: int
     rounds: int

@@ -1,4 +1,4 @@
-"""One step of matching a large pair, for one tile: what :mod:`rille.stages.hfvm.finest` composes, as tasks.
+"""One step of matching a large pair, for one tile: the steps of :mod:`rille.stages.hfvm.finest` as tasks.
 
 Steps ``coarse`` and ``ending`` are of the whole pair, ``fine`` and ``final`` of one tile.
 """

@@ -1,12 +1,12 @@
-"""The trajectory adjusted to what else is known between its frames, such as places that are seen again.
+"""Adjustment of the trajectory to other measurements between its frames: places seen again, other sensors.
 
 The chain of segments (:mod:`rille.stages.odometry.resection.trajectory`) is a pose graph without loops: each frame is
 measured from the key frame of its segment, with errors of its own and with those that all segments share. Factors
 between other frames close loops in it, or join pieces between which the chain is broken; then all poses are adjusted
 together (:mod:`rille.stages.odometry.pose_graph`). A factor that contradicts the others is left out and named.
 
-Errors of the calibration are sources of the graph, too. They show in stated motions as in those of the chain (the more,
-the longer the way), which are measured with the same cameras: only other sensors can tell them.
+Errors of the calibration are sources of the graph, too. They are in stated motions as in those of the chain (the more,
+the longer the way), since both are measured with the same cameras: only other sensors determine them.
 
 Pieces that factors join become one piece, in the frame of the first of them. Pieces without factors stay bit by bit.
 """
@@ -90,8 +90,8 @@ def measured_alike(stated: Factors, chain: Factors, calibration: int) -> Factors
 def join(own: OwnTrajectory, factors: Factors, sure: Bools) -> OwnTrajectory:
     """Pieces laid together by the factors between them, each by the one that most others agree with.
 
-    Within a piece the chain contradicts a place that is taken for another; between two pieces nothing but a second
-    factor, so that one alone joins them only if it is ``sure``.
+    Within a piece the chain contradicts a place that is taken for another. Between two pieces only a second factor can,
+    so one alone joins them only if it is ``sure``.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def join(own: OwnTrajectory, factors: Factors, sure: Bools) -> OwnTrajectory:
 
 
 def _moved(poses: Floats, rows: Bools, ends: NDArray[np.intp], pose: Floats) -> Floats:
-    """Poses (n, 3, 4), those of some rows moved as one so that a factor with one end in them holds."""
+    """Poses (n, 3, 4); those of some rows are moved together so that a factor with one end in them holds."""
     a, b, measured = (RigidTransform.from_matrix(T) for T in (*poses[ends], pose))
     return moved(poses, rows, a @ measured @ b.inverse() if rows[ends[1]] else b @ measured.inverse() @ a.inverse())
 
@@ -192,7 +192,7 @@ Piece = tuple[NDArray[np.intp], NDArray[np.intp], Adjusted]
 def adjusted_pieces(own: OwnTrajectory, apart: Floats, known: Factors, sensors: Sensors) -> Iterator[Piece]:
     """Nodes of each piece that is adjusted, the numbers of the factors between them, and their adjustment.
 
-    A piece that factors joined which contradict the rest falls into parts, each adjusted by itself and in the frame of
+    A piece whose joining factors contradict the others falls into parts, each adjusted by itself and in the frame of
     its first piece: ``apart`` (n, 3, 4) are poses in the frames of their pieces.
     """
     waiting = [np.flatnonzero(own.piece == number) for number in np.unique(own.piece)]

@@ -1,9 +1,9 @@
 """Joint adjustment of a segment: all its poses and the depths of its landmarks at once, by least squares.
 
-Resection poses each frame by itself, with landmarks as the key pair's disparity has them. Here the landmarks' depths
-are unknowns, too, each held by its disparity: a point that four frames see from four places says more of its depth than
-its disparity alone; and so is an error that all disparities share. The disparity of the basic pair at the segment's end
-is no second measurement: it shares its errors with the first and gains little.
+Resection poses each frame by itself, with landmarks from the key pair's disparity. Here the landmarks' depths are
+unknowns, too, each held by its disparity: four views determine the depth of a point better than its disparity alone. An
+error that all disparities share is one more unknown. The disparity of the basic pair at the segment's end is no second
+measurement: it shares its errors with the first and gains little.
 
 Huber's weights, Levenberg-Marquardt. A landmark has one unknown (along its ray), so that its elimination (Schur's
 complement) is a division, and the system has the size of the poses (Triggs, McLauchlan, Hartley, Fitzgibbon 2000,
@@ -105,7 +105,7 @@ class SegmentAdjustment:
     params: ResectParams
 
     def observations(self, f: int) -> Observations:
-        """Frame ``f`` by itself, landmarks as their disparities have them."""
+        """Observations of frame ``f`` by itself, with landmarks from their disparities."""
         tracks = self.tracks
         return Observations(tracks.landmarks, tracks.pixels[f], tracks.camera, self.params.pixel_sigma)
 
@@ -151,7 +151,7 @@ class SegmentAdjustment:
         return out._replace(cost=cost)
 
     def ahead(self, state: SegmentState, normal: SegmentNormal, damping: float) -> SegmentState:
-        """The state one damped step on."""
+        """The state after one damped step."""
         poses, depths = normal.poses + damping * np.diag(np.diag(normal.poses)), normal.depths * (1.0 + damping)
         matrix, right = normal._replace(poses=poses, depths=depths).without_depths()
         step = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
@@ -176,7 +176,7 @@ class SegmentAdjustment:
 
 
 def adjust(tracks: SegmentTracks, start: SegmentState, params: ResectParams) -> Minimum[SegmentState]:
-    """The state of least cost; never worse than its start by the same cost."""
+    """The state of least cost; its cost never exceeds that of the start."""
     # About 5 steps suffice.
     return levenberg_marquardt(SegmentAdjustment(tracks, params), start, 20)
 
@@ -217,7 +217,7 @@ class PosedTracks(NamedTuple):
         return moved._replace(tracks=replace(self.tracks, seen=self.tracks.seen & (z >= NEAREST_M)))._determined()
 
     def _determined(self) -> PosedTracks | None:
-        """The same without the frames that too few landmarks see to determine a pose; None if no frame is left."""
+        """The same without frames that see too few landmarks for a pose; None if no frame is left."""
         enough = self.tracks.seen.sum(1) >= MIN_LANDMARKS
         tracks = replace(self.tracks, pixels=self.tracks.pixels[enough], seen=self.tracks.seen[enough])
         state = self.state._replace(R=self.state.R[enough], t=self.state.t[enough])

@@ -8,15 +8,15 @@ and the priors of a usual calibration give the errors and their covariance; the 
 that all segments share.
 
 The rig's yaw is an error that all disparities share: near and far landmarks ask for different motions. A straight
-drive shows that as well, so that all segments count for it, each by what its own common error says. Where one camera
-stands above the other, pitch is that error, and takes its place.
+drive shows that as well, so all segments count for it, each by its own common error. Where one camera stands above the
+other, pitch takes its place.
 
-Rows that are read one after the other (a rolling shutter) are of unlike times: what wanders down the image moved for
-longer than what does not. That looks like a wrong rig, which is then left as it is, and named.
+A rolling shutter reads the rows one after the other: a point that wanders down the image moved for longer than one that
+does not. That looks like a wrong rig, which is then left as it is, and named.
 
-A number that the tracks contradict is corrected, and all that rests on it is computed anew: images are undistorted, rig
-and segments found with the corrected calibration, so that poses and maps are of one. An error that does not contradict
-its prior is part of the covariance alone. Held is the baseline's length, which no image shows.
+A number that the tracks contradict is corrected, and images, rig, segments and maps are computed anew with the
+corrected calibration. An error that does not contradict its prior is part of the covariance alone. The length of the
+baseline is held, because no image shows it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ correction (:mod:`rille.stages.geometry.epipolar`), rad. With each its standard 
 the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
 
 CORRECTED = 3
-"""How many of these are corrected: those of the camera without distortion."""
+"""Number of these that are corrected: those of the camera without distortion."""
 
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
@@ -72,10 +72,10 @@ MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
 before it is corrected, which each says far better."""
 
 MIN_ERROR = 0.0175
-"""Error over the focal length up to which calibrations pass for good: what remains of lens distortion looks like it."""
+"""Error over the focal length up to which a calibration counts as good: remaining lens distortion looks like it."""
 
 MIN_CHANGE = 0.004
-"""The same of a camera that was corrected: which prior it had is no longer believed."""
+"""The same of a corrected camera, whose prior is no longer believed."""
 
 MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
@@ -113,10 +113,13 @@ class SegmentCameras(NamedTuple):
 
 
 class IntrinsicsPart(NamedTuple):
-    """What a segment says of k errors: ``information`` (k, k), ``pull`` (k,); ``by_error`` (frame, 6, k) changes of its
-    poses (position m, rotation vector rad of T_local_left) with each. ``yaw``: information and pull of the rig's yaw,
-    rad, by the common error of its disparities, without the prior of that, which would draw it towards zero.
-    ``read_out``: those of the time from the first to the last row, in intervals between frames."""
+    """Contribution of a segment to k errors: ``information`` (k, k), ``pull`` (k,).
+
+    ``by_error`` (frame, 6, k): changes of its poses (position m, rotation vector rad of T_local_left) with each.
+    ``yaw``: information and pull of the rig's yaw, rad, by the common error of its disparities, without the prior of
+    that, which would draw it towards zero. ``read_out``: those of the time from the first to the last row, in intervals
+    between frames.
+    """
 
     information: Floats
     pull: Floats
@@ -149,7 +152,7 @@ def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
 
 
 def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Floats) -> Floats:
-    """One correction that changes a calibration as two do one after the other."""
+    """One correction in place of two that follow each other."""
     larger = 1.0 + before[0]
     scale = np.array([larger, larger, larger, 1.0])  # those of the cameras are over the focal length
     return np.array(before) + scale * correction
@@ -194,7 +197,7 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
 
 
 def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: SegmentCameras) -> IntrinsicsPart:
-    """What an adjusted segment says of the errors of :data:`PRIORS`, all its unknowns free, by the stated errors."""
+    """Contribution of an adjusted segment to the errors of :data:`PRIORS`, its unknowns free, by the stated errors."""
     tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
     *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
     steps = [replace(problem, tracks=one) for one in (*changed, read_late(tracks, cameras, STEP))]
@@ -259,8 +262,8 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
     """Errors that all segments share, by their parts and the priors; a prior that they contradict is left out.
 
     The segments' own values scatter by more than their errors, for their landmarks are few and near each other; the
-    scatter decides. Of priors that are contradicted the one that is most goes first: where the camera turns about one
-    axis, one wrong number looks like another one.
+    scatter decides. The prior that is contradicted most is dropped first: where the camera turns about one axis, one
+    wrong number looks like another one.
 
     Parameters
     ----------
@@ -294,7 +297,7 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
 
 
 def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
-    """One line on the numbers of the cameras that are not those given; empty where all are.
+    """One line on the numbers of the cameras that were corrected; empty if none was.
 
     Parameters
     ----------
@@ -358,8 +361,8 @@ def intrinsics_stage(
 ) -> Bundle[IntrinsicsFacts]:
     """Errors of the calibration that the tracks of all segments show.
 
-    ``before`` is the correction that was made already; with ``fixed`` the rig keeps its yaw. The yaw is corrected
-    first: while it is wrong, so is what the tracks say of the cameras.
+    ``before`` is the correction so far; with ``fixed`` the rig keeps its yaw. The yaw is corrected first: while it is
+    wrong, the tracks mislead about the cameras.
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
     # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
@@ -377,7 +380,7 @@ def intrinsics_stage(
     )
 
     def alone(name: str, least: float) -> tuple[CommonErrors, float]:
-        """A number by itself, and its value where enough segments agree that it is not 0."""
+        """Estimate of one number alone, and its value if enough segments agree that it is not 0."""
         shown = np.array([part[name] for part in parts]).reshape(-1, 2, 1)
         # Any is as likely: drawn to 0 by a prior, few segments that agree would seem to contradict each other.
         found = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)

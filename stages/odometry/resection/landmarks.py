@@ -57,7 +57,7 @@ class Landmarks:
         return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if count) or "none lost"
 
     def take(self, which: NDArray[np.intp]) -> Landmarks:
-        """Some of them."""
+        """The chosen landmarks."""
         arrays = self.position[which], self.per_pixel[which], self.sigma[which], self.inverse_parallax[which]
         return Landmarks(*arrays, self.lost)
 

@@ -106,7 +106,7 @@ def _posed(a: Features, b: Features, matches: NDArray[np.uint32], seed: int) -> 
 
 
 class Closure(NamedTuple):
-    """By how much a loop corrects the chain: m, degrees, and ``chi``, the root of the mean squared error over its
+    """Correction of the chain by a loop: m, degrees, and ``chi``, the root of the mean squared error over its
     expected standard deviation; all None between pieces. ``left_m`` is what the adjusted trajectory leaves of it, None
     where that has not joined the pieces."""
 
@@ -131,7 +131,7 @@ def closure(factor: Mapping[str, Any], chained: Bundle, adjusted: Bundle) -> Clo
     off = np.concatenate([b.translation - closed.translation, rotation_log(b.rotation @ closed.rotation.T)])
     lever, turn = propagation(a, a, b)
     first, last = (np.asarray(chained["covariance"][row]) for row in rows)
-    # What the chain has gathered since the first frame; errors that all segments share may make it seem negative.
+    # The chain's errors since the first frame; errors that all segments share may make it seem negative.
     values, vectors = np.linalg.eigh(last - lever @ first @ lever.T)
     expected = (vectors * np.maximum(values, 0.0)) @ vectors.T + turn @ loop @ turn.T
     move, angle = np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))
@@ -139,7 +139,7 @@ def closure(factor: Mapping[str, Any], chained: Bundle, adjusted: Bundle) -> Clo
 
 
 def _blocks(points: Floats, camera: Camera) -> int:
-    """In how many parts of the image there is one of the points (n, 2)."""
+    """Number of parts of the image that hold one of the points (n, 2)."""
     part = np.floor((points + 0.5) * BLOCKS / [camera.width, camera.height]).clip(0, BLOCKS - 1)
     return len(np.unique(part, axis=0))
 

@@ -1,4 +1,4 @@
-"""Pixels of a basic pair that moved by themselves: what the still scene and the camera's motion do not explain.
+"""Pixels of a basic pair that moved by themselves: neither the still scene nor the camera's motion explains them.
 
 A point with a known distance has a place in the next left image that follows from the camera's motion alone. Where the
 measured displacement (stage ``motion``) leads elsewhere, by more than both are uncertain by, over a connected part of
@@ -31,7 +31,7 @@ class MovingParams(Params):
 def departures(
     disparity: Bundle, motion: Bundle[MotionFacts], rig: Rig, T_b_a: RigidTransform, *, back: bool
 ) -> Floats:
-    """How far (row, col) each pixel of the coarse grid moved otherwise than the still scene, in its pixels.
+    """Departure (row, col) of each pixel of the coarse grid from the motion of the still scene, in its pixels.
 
     Less the uncertainty of the scene's own place; NaN where the disparity or the displacement is not known.
 

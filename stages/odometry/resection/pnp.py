@@ -166,7 +166,7 @@ class PoseAdjustment:
         return Normal(matrix, gradient, weight, huber_costs(errors.norm[self.active]) + 0.5 * prior * bias**2)
 
     def ahead(self, pose: Pose, normal: Normal, damping: float) -> Pose:
-        """The pose one damped step on."""
+        """The pose after one damped step."""
         diagonal = np.diag(normal.matrix)
         # Damping scales with the diagonal, which is 0 for an unknown that no landmark determines.
         damped = normal.matrix + np.diag(damping * diagonal + 1e-12 * diagonal.max() + 1e-300)

@@ -3,9 +3,9 @@
 Its covariance is without errors of the calibration where a plane gives the vertical. A wrong focal length lifts the
 camera on its way and tilts the ground that it sees alike; the world's vertical follows the ground: no height is off.
 
-A trajectory that is adjusted to a place seen again moves all poses, most of them by less than shows in a map. Where an
-elevation model would move by at most a quarter of a cell, anywhere in it, its pose stays that of the chain, covariance
-and all: so the model, and world tiles of such models alone, are those of the run without that place.
+The adjustment to a place seen again moves all poses, most of them by less than a map shows. If no part of an elevation
+model would move by more than a quarter of a cell, its pose and covariance stay those of the chain: so the model, and
+world tiles of such models alone, are those of the run without that place.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def pose_stage(
         # A model may lie a quarter of a cell off its adjusted place.
         used = chained if greatest_move(before, after, local.meta) <= 0.25 else trajectory
     arrays = {name: used[name][row : row + 1].copy() for name in ("poses", "covariance") if name in used.arrays}
-    # Of another trajectory than that of the segments nothing says what the calibration has to do with it.
+    # How the calibration acts on another trajectory than that of the segments is not known.
     if "own_covariance" in used.arrays:
         vertical = used.meta["verticals"][int(used["piece"][row])]
         if vertical in (GROUND_PLANE, REFERENCE_PLANE):

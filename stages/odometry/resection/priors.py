@@ -31,7 +31,7 @@ from rille.stages.odometry.resection.sensors import (
 )
 
 MIN_LEAN = math.radians(0.05)
-"""Of the world against the vertical that is not worth a word: 1 mm a metre."""
+"""Lean of the world against the vertical below which no line is given: 1 mm a metre."""
 REMEDY = {
     "odometry": "correct T_body_left, unit, time_offset, the quaternions' order or the poses' direction (body to "
     "world), or raise drift and turn_deg",
@@ -45,7 +45,7 @@ UNLEVEL = "positions are turned about the vertical alone, and nothing tells of t
 
 
 class Clock(NamedTuple):
-    """By how much (s) a sensor's times are late against the camera's, and the standard deviation of that."""
+    """Delay, s, of a sensor's times against the camera's, and its standard deviation."""
 
     late: float = 0.0
     sigma: float = OFFSET_SIGMA_S
@@ -74,7 +74,7 @@ class Sensors:
 
     @staticmethod
     def of(given: Mapping[str, Any], frames: int) -> Sensors:
-        """Of the argument of stage ``adjust``, which has so many frames."""
+        """Read the argument of stage ``adjust``, which has so many frames."""
 
         def stacked(name: str, key: str, shape: tuple[int, ...]) -> Floats:
             missing = np.full(shape, np.nan)
@@ -228,7 +228,7 @@ class Sensors:
                 self.lines.append(f"{TITLES[name]} {count} of its measurements contradict the others and are left out")
 
     def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
-        """Say where the world lies in the frame of positions, unless that is stated."""
+        """State where the world lies in the frame of positions, unless that is given."""
         there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ prior.laid).inverse()
         # The first camera is the origin of a world with a place, though not of one on a plane that is no ground.
         origin, ahead = there.apply(done.state.C[0]), there.rotation[:, 1]
@@ -255,7 +255,7 @@ class Sensors:
             self.lines.append(f"[positions] contradict the stated place: {text}; by them {named}: state these")
 
     def _level(self, done: Adjusted) -> None:
-        """Say by how much the world leans against the positions' vertical, if they show it."""
+        """State by how much the world leans against the positions' vertical, if they show it."""
         variances, axes = np.linalg.eigh(done.graph.covariance(done.state)[-1, 3:5, 3:5])
         # The top of z moves by w x z. Along a straight way positions show one turn of two: the other is left as it is.
         x, y, _ = done.state.R[-1, :, 2]

@@ -5,9 +5,9 @@ The landmarks are points of the segment's key frame, triangulated in its stereo 
 (:mod:`rille.stages.odometry.resection.robust_pose`). A pose is refused where the landmarks that contradict it agree
 with another one. Then all poses and the landmarks' depths are adjusted jointly
 (:mod:`rille.stages.odometry.resection.bundle_adjustment`). An error of the calibration shows over the whole sequence
-only: each segment gives what it says of it, and how its poses change with it
-(:mod:`rille.stages.odometry.resection.intrinsics`). A pair whose disparities depart from the landmarks' shows that the
-rig was knocked.
+only: each segment gives its contribution, and how its poses change with it
+(:mod:`rille.stages.odometry.resection.intrinsics`). If the disparities of a pair depart from the landmarks', the rig
+was knocked.
 """
 
 from __future__ import annotations
@@ -48,6 +48,11 @@ MIN_JUMP_PX = 1.0
 rig was knocked; of sound rigs it stays below 0.2."""
 
 
+MIN_AGREEING_SHARE = 0.3
+"""Share of the landmarks below which a pose that these agree with is not believed: of a street 0.9 agree, by night and
+beside a mirror 0.6; of a crowd all over the image 0.2 may, with any pose."""
+
+
 MAX_TORN_SHARE = 0.2
 """Share of a basic pair's disparities that depart otherwise than the others, by twice :data:`MIN_JUMP_PX`, from which
 on a part of one image is displaced; of sound pairs 0.02 do, by night 0.1."""
@@ -67,7 +72,7 @@ class SegmentPoses:
 
     @staticmethod
     def unposed(points: SegmentPoints) -> SegmentPoses:
-        """Nothing is known of any frame."""
+        """Poses of which none is known."""
         count, frames = points.tracks.shape[:2]
         return SegmentPoses(
             np.full((frames, 3, 4), np.nan),
@@ -127,6 +132,9 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
                 posed = posed_by(use, j)
+            if (agreeing := int(posed.inlier.sum())) < MIN_AGREEING_SHARE * use.size:
+                text = f"only {agreeing} of {use.size} landmarks agree with one pose: most move, or are mistracked"
+                raise DegenerateError("RIL-751", text, remedy="mask what moves by itself, or what repeats")
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
             if isinstance(error, AmbiguousError) and not doubt:
@@ -146,9 +154,9 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
 def adjust_segment(
     points: SegmentPoints, segment: SegmentPoses, cameras: SegmentCameras, params: ResectParams
 ) -> dict[str, Any]:
-    """Adjust the poses of a segment jointly with its landmarks, in place; what it says of errors of the calibration.
+    """Adjust the poses of a segment jointly with its landmarks, in place; return its part in errors of the calibration.
 
-    A frame that keeps too few landmarks keeps the pose of its resection. Nothing is said where no frame is adjusted.
+    A frame that keeps too few landmarks keeps the pose of its resection. None: no frame is adjusted.
     """
     start = PosedTracks.of(points, segment.poses, segment.inlier)
     end = start and start.adjusted(adjust(start.tracks, start.state, params).state)

@@ -133,7 +133,7 @@ def resect(
     ----------
     landmarks : n of them, in the local frame; all finite.
     pixels : (n, 2) column, row.
-    starts : predictions of T_local_left, which decide nothing but where the search starts.
+    starts : predictions of T_local_left, at which the search starts.
     frame : its number, for messages and for the seed of the random samples.
 
     Raises
@@ -317,7 +317,7 @@ def scatter_of_blocks(pixels: Floats, white: Floats, weight: Floats, camera: Cam
 
 
 def correlation(block_scatters: Sequence[float]) -> float:
-    """Variance of poses over that by independent errors: the mean of what :func:`scatter_of_blocks` gives, at least 1.
+    """Variance of poses over that by independent errors: the mean of :func:`scatter_of_blocks`, at least 1.
 
     Of one frame it scatters by a fifth; frames of a segment share their landmarks.
     """

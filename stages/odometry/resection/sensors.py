@@ -26,9 +26,9 @@ from rille.stages.geometry.rigid import compose, motion, posed, standing_out, um
 from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
-"""Of each component of a lever arm that is stated."""
+"""Standard deviation of each component of a stated lever arm."""
 OFFSET_SIGMA_S = 0.5
-"""Of a sensor's clock against the camera's, before anything is known of it."""
+"""Standard deviation of a sensor's clock against the camera's, before anything is known of it."""
 MIN_FIXES = 3
 """Positions of a piece from which on it is laid on them."""
 CAMERA_SHARE = 0.05
@@ -49,12 +49,12 @@ class OwnTrajectory(NamedTuple):
     rows: NDArray[np.intp]
 
     def take(self, nodes: NDArray[np.intp]) -> OwnTrajectory:
-        """Some of its nodes."""
+        """The trajectory at some of its nodes."""
         return OwnTrajectory._make(values[nodes] for values in self)
 
 
 class SharedError(NamedTuple):
-    """What all measurements of a sensor share, in words, and its standard deviation in a unit."""
+    """An error that all measurements of a sensor share, in words, with its standard deviation in a unit."""
 
     name: str
     sigma: float
@@ -74,7 +74,7 @@ class Sensor(Protocol):
         ...
 
     def factors(self, own: OwnTrajectory, late: float) -> Factors:
-        """What it says of these nodes, its clock being ``late``, s; the place is node -1, the last source the clock."""
+        """Its factors on these nodes, its clock being ``late``, s; the place is node -1, the last source the clock."""
         ...
 
 
@@ -105,7 +105,7 @@ def resampled(poses: Floats, times: Floats, shift: float) -> Floats:
 
 
 def departure(own: Floats, said: Floats, allowed: float, what: str) -> tuple[float, str]:
-    """By which share vectors (m, 3) of a sensor depart from the camera's; how, where it is more than allowed."""
+    """Share by which vectors (m, 3) of a sensor depart from the camera's; in words how, if it is more than allowed."""
     # The adjustment leaves out single ones that stand out, as of a jump.
     usual = ~standing_out(np.linalg.norm(own - said, axis=1))
     own, said = own[usual], said[usual]
@@ -303,7 +303,7 @@ class PositionPrior:
             if why and standing_out(steps).any():
                 at = int(steps.argmax())
                 x, y = fixes.positions[mine][at, :2]
-                why += f"; they jump by {steps[at]:.2g} m behind ({x:.2f}, {y:.2f})"
+                why += f"; they jump by {steps[at]:.2g} m after ({x:.2f}, {y:.2f})"
             found.append((off, why))
         return max(found, key=lambda one: (bool(one[1]), one[0]), default=(math.inf, ""))
 
@@ -392,7 +392,7 @@ def pieces_with_fixes(fixes: Fixes, piece: NDArray[np.int16]) -> list[int]:
 
 
 def anchor(pose: Floats) -> Factors:
-    """What is known of the place beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
+    """Factor of the place known beforehand, by the pose (3, 4) of node 0: it is about upright in the world."""
     # 5 degrees: of the world's vertical against that of the place: a plane of ground is a slope.
     root = np.diag([1e-3] * 3 + [1.0 / math.radians(5.0)] * 2 + [0.1])[None]
     return Factors.of(np.array([[-1, 0]]), pose[None], root)

@@ -7,17 +7,17 @@ frame of a segment and ``i`` another of its frames,
     T_world_left(i) = T_world_left(k) T_local_left(k)^-1 T_local_left(i),
 
 so that ``T_world_local(k) = T_world_left(k) T_local_left(k)^-1`` whatever the levelling of pair k is. The next
-segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: what follows is a
-piece of its own, in the local frame of its first basic pair.
+segment's key frame is the last frame of this one. Where that frame is lost the trajectory breaks: a new piece begins,
+in the local frame of its first basic pair.
 
 If the first pair of a piece has no source of the vertical, the vertical of the first pair that has one is carried back
 along the piece. If no pair has one, the frame of the piece is that of its first camera, whose own up is z; the result
 says so.
 
-Of the covariances, what each segment has for itself adds up; of what all segments share, the errors add up, which grows
-with the length of the way and not with its root (:mod:`rille.stages.odometry.resection.resect`). So do those of the
-calibration (:mod:`rille.stages.odometry.resection.intrinsics`). Without these the covariance is given, too: a plane of
-ground that they tilt defines the world's vertical, so that they tilt no elevation above it.
+Of each segment's own errors the covariances add up. Of errors that all segments share, as those of the calibration
+(:mod:`rille.stages.odometry.resection.intrinsics`), the errors themselves add up: they grow with the length of the way
+and not with its root (:mod:`rille.stages.odometry.resection.resect`). The covariance is also given without errors of
+the calibration: a plane of ground that they tilt defines the world's vertical, so that they tilt no elevation above it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,11 @@ from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
-from rille.stages.geometry.pose_arrays import COVARIANCE, NO_VERTICAL, OWN_COVARIANCE, POSES
+from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, NO_VERTICAL, OWN_COVARIANCE, POSES
+
+MAX_TILT_DEG = 5.0
+"""Degrees between the verticals by the ground of two pairs: on a street and in a hall at most 2.7, by bad matches 5 to
+28."""
 
 
 class ChainLink(NamedTuple):
@@ -79,7 +83,7 @@ class Chained:
 
     @staticmethod
     def unposed(frames: int) -> Chained:
-        """All frames are lost."""
+        """Poses of frames that are all lost."""
         covariance, lost = np.full((frames, 6, 6), np.nan), np.full(frames, -1, np.int16)
         return Chained(np.full((frames, 3, 4), np.nan), covariance, covariance.copy(), lost, lost.copy())
 
@@ -190,6 +194,28 @@ def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle])
     return sources
 
 
+def _unlike_verticals(
+    frames: Sequence[int], found: Chained, keys: Sequence[int], levels: Sequence[Bundle]
+) -> Iterator[str]:
+    """Lines on pieces whose vertical is that of the ground of their first pair, and not that of the others' ground.
+
+    ``keys`` are the rows of the pairs that ``levels`` are of.
+    """
+    for piece in range(int(found.piece.max()) + 1):
+        tilts = dict[int, float]()
+        for key, level in zip(keys, levels, strict=True):
+            if found.piece[key] == piece and level.meta["source"] == GROUND_PLANE:
+                up = found.poses[key, :, :3] @ RigidTransform.from_matrix(level.meta["T_local_left"]).rotation[2]
+                tilts[frames[key]] = math.degrees(math.atan2(math.hypot(up[0], up[1]), up[2]))
+        odd = [frame for frame, tilt in tilts.items() if tilt > MAX_TILT_DEG]
+        if odd:
+            yield (
+                f"by the ground of {len(odd)} of {len(tilts)} pairs, first pair {odd[0]}, the vertical is off by up to "
+                f"{max(tilts.values()):.0f} degrees: the ground bends, or is matched badly, and slopes and hazards are "
+                "wrong; state world.up or world.pitch_deg, or give an attitude"
+            )
+
+
 def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
     """Facts of a trajectory, and lines on what is missing.
 
@@ -247,7 +273,7 @@ def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> di
 
 
 class TrajectoryInputs(NamedTuple):
-    """Segments, levels of their key frames, and what the segments say of the cameras."""
+    """Segments, levels of their key frames, and the segments' errors of the calibration."""
 
     segments: Sequence[Bundle[ResectFacts]]
     levels: Sequence[Bundle[GroundFacts]]
@@ -300,4 +326,5 @@ def trajectory_stage(
         "inliers": [inliers.get(f, 0) for f in frames],
         **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
     }
+    meta["warnings"] += _unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)
     return Bundle(vars(found), meta)

@@ -1,8 +1,8 @@
-"""Two motions in view: which is the camera's, and which landmarks move by themselves.
+"""Two motions in view: choice of the camera's, and landmarks that move by themselves.
 
 Landmarks of a vehicle ahead, of a passing lorry, or of the own body agree with another pose than those of the scene.
-The scene is the part that lies beside the other in the image, mostly, and goes on behind it. Where that holds of
-neither, the images do not tell which of the two the camera moves against, and the frame has no pose.
+The scene is the part that lies mostly beside the other in the image, and goes on behind it. If that holds of neither,
+the images do not show which of the two is at rest, and the frame has no pose.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BODY_SHARE = 0.1
 
 
 class AmbiguousError(DegenerateError):
-    """Two motions have large support: which is the camera's, the landmarks do not tell."""
+    """Two motions have large support, and the landmarks do not show which is the camera's."""
 
 
 class _Part(NamedTuple):

@@ -6,7 +6,7 @@ worst heading) is a hazard to its middle. Unknown ground may not be under the be
 (below). The centres of the wheels keep the margin from it as from a hazard, because unknown ground is mostly hidden by
 a stone, or is the stone itself.
 
-How high ground that was not seen may be is known where lines of sight pass over it
+Lines of sight that pass over unseen ground bound its height
 (:mod:`rille.stages.terrain.occlusion_bounds`). A vehicle whose wheels all stand on ground that was seen then has, at
 each point of its belly, a rise below it of at most
 

@@ -73,7 +73,7 @@ CAUTION_COST = 0.2
 PROXIMITY_COST = 0.5
 """Added to the cost of a metre at the margin of a hazard; it falls to 0 at twice the margin."""
 HERE_WHEELBASES = 0.3
-"""Radius around the start pose within which a cell is accepted if its clearance is not below that of the start."""
+"""Radius around the start pose within which a cell is accepted if its clearance is at least that of the start."""
 NEAR_WHEELBASES = 3.0
 """Distance beyond which doubtful ground will be seen again from nearer, where most doubts vanish."""
 CLOSED_WHEELBASES = 0.8
@@ -184,7 +184,7 @@ class Ground:
 
     def open_track(self, track: Sequence[tuple[float, float, float]]) -> None:
         """Let the vehicle go back over places where it stood, x, y (m) and heading (rad) in order, whatever the map
-        says of them now."""
+        shows there now."""
         stands = np.array([*track, (*self.start, self.heading)])
         stands[:, 2] = np.unwrap(stands[:, 2])
         way, turn = np.hypot(*np.diff(stands[:, :2], axis=0).T), np.abs(np.diff(stands[:, 2]))
@@ -206,7 +206,7 @@ class Ground:
         return pieces(self.graph, self.graph.follow(move))
 
     def again(self, way: Sequence[Piece]) -> tuple[list[Piece], float]:
-        """A path planned at an earlier stop: its pieces, split where they stop being known, and its cost now.
+        """A path planned at an earlier stop: its pieces, split at the end of known ground, and its cost now.
 
         Its margin may be short by a cell: it was planned on poses of the lattice and is sampled more closely here.
         """

@@ -91,8 +91,8 @@ class PlannerMemory:
     track: Sequence[Stand] = ()
 
     def after(self, verdict: str, where: Point | None = None) -> Literal["end", "again", "drive"]:
-        """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.policy.Leg`); return what
-        follows: the end, another plan from the same place, or the drive.
+        """Update the memory after a planned leg (:class:`rille.stages.planning.local_planner.policy.Leg`); return the
+        next action: the end, another plan from the same place, or the drive.
 
         Parameters
         ----------

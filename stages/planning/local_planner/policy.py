@@ -217,7 +217,7 @@ def _line(way: Sequence[Piece], start: Point) -> tuple[Floats, NDArray[np.int8]]
 
 
 def _onward(before: Before, start: Point, heading: float, least: float) -> list[Piece]:
-    """Rest of a way from where the vehicle is now; vertices nearer than ``least`` metres are passed."""
+    """Rest of a way from the vehicle's place; vertices nearer than ``least`` metres are passed."""
     (points, gear), first = before, 1
     while first + 1 < len(points) and math.hypot(*(points[first] - start)) < least:
         first += 1
@@ -233,7 +233,7 @@ def _stay(
     turn: float = 0.0,
     where: Point | None = None,
 ) -> Leg:
-    """A leg on the spot."""
+    """A leg without a path, on the spot."""
     return Leg(verdict, reason, *_line([], start), turn, vertices(way, start), *_line(way, start), where)
 
 

@@ -18,7 +18,7 @@ Clear = Callable[[Floats, Floats, Floats], bool]
 
 STEP_TURN = math.radians(5.0)
 MIN_LENGTH_M = 1e-9
-"""m; a shorter piece is what rounding leaves over, and has no heading."""
+"""m; a shorter piece is a rounding error, and has no heading."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def straightened(way: Sequence[Piece], heading: float, clear: Clear, spacing: fl
     i = 0
     while i < len(way):
         last = i
-        # Within one gear: where the vehicle reverses there is a reason to be.
+        # Within one gear: a place where the vehicle reverses has its reason, and stays.
         while last + 1 < len(way) and way[last + 1].gear == way[i].gear:
             last += 1
         j, best = i, way[i]

@@ -1,8 +1,8 @@
 """The next leg of a drive to a goal, by the hazards that are known so far: stage ``local_planner``.
 
-What was seen from near may be driven on, what was seen from afar serves to plan
-(:mod:`rille.stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; where that
-closes every way, only what is next to certain does.
+Ground seen from near may be driven on, ground seen from afar serves to plan
+(:mod:`rille.stages.planning.local_planner.policy`). Far hazards close ground only once they are probable; if they close
+every way, only nearly certain ones do.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ had an edge that the map missed, of all places 0.37 %."""
 
 
 class SeenGround(NamedTuple):
-    """Hazards (:mod:`rille.stages.hazard.risk`) of what was seen from near, and of all that was seen, None: that is the
-    same; bounds of the ground that was not."""
+    """Hazards (:mod:`rille.stages.hazard.risk`) of ground seen from near, and of all seen ground (None: the same);
+    bounds of unseen ground."""
 
     near: Bundle
     far: Bundle | None = None
@@ -82,8 +82,8 @@ def next_leg(
 def shortest_way(
     risk: Bundle, stand: Stand, goal: Point, params: LocalPlannerParams
 ) -> tuple[float | None, float | None]:
-    """Length (m) of the shortest way where all is known, and the margin (m) that it keeps: the vehicle's, or none where
-    the margin, which is for what a vehicle does not know, closes every way. None: there is no way."""
+    """Length (m) of the shortest way where all is known, and its margin (m): the vehicle's, or 0 if that, which is kept
+    for the unknown, closes every way. None: there is no way."""
     lattice, vehicle = Lattice.from_dict(risk.meta["lattice"]), Vehicle.model_validate(risk.meta["vehicle"])
     hazards = Hazards(*(np.asarray(risk[name]) for name in HAZARD_MAPS))
     for margin in (vehicle.margin, 0.0):
@@ -122,7 +122,7 @@ def _stands(poses: Floats, T_vehicle_left: RigidTransform) -> list[Stand]:
 
 
 class LegInputs(NamedTuple):
-    """Hazards of near ground, of all that was seen, and bounds of the ground that was not; pose and rig of the cameras;
+    """Hazards of near ground and of all seen ground, and bounds of unseen ground; pose and rig of the cameras;
     the leg before; poses of the left camera on the way so far."""
 
     risk: Bundle[RiskFacts]

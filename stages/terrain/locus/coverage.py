@@ -1,10 +1,10 @@
-"""Which of a pair's matched pixels its map holds, and by which limits it would hold nearly all of them.
+"""Share of a pair's matched pixels that its map holds, and limits with which it would hold nearly all.
 
-A matched pixel that the map lacks lies outside of it; or the cell there is too unsure to be given; or it is off the
-surface, hidden by what is higher there or on a face that stands upright on the plane, and no limit brings it in.
+The map lacks a matched pixel for one of three reasons: the pixel lies outside of it; its cell is too uncertain; or it
+is off the surface (hidden from above, or on an upright face), where no limit helps.
 
-A map without any cell has a reason of its own: a surface that the cameras do not see asks for another change than bad
-matches do (:func:`explain`).
+:func:`explain` gives the reason of a map without any cell: bad matches ask for another change than a surface that the
+cameras do not see.
 """
 
 from __future__ import annotations
@@ -120,5 +120,5 @@ def coverage(
 
 
 def _upper_quantile(values: Floats) -> float:
-    """What nearly all of the values do not exceed, with some room for what is rounded."""
+    """Bound that nearly all values do not exceed, with room for rounding."""
     return 1.05 * float(np.quantile(values, 0.95))

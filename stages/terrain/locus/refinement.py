@@ -1,4 +1,4 @@
-"""Elevations refined where they belong: on the surface, by what both images show of it.
+"""Refinement of elevations on the surface, until both images agree there.
 
 Locus reads each cell from the disparity around one pixel. Here the elevations Z of all solved cells minimise together
 
@@ -35,7 +35,7 @@ MEAN_SIDE_CELLS = 15
 
 
 def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
-    """Elevations that fit both images best, and what the images show there.
+    """Elevations at which both images agree best, and the views of the images there.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: in
 
     Returns
     -------
-    elevation (rows, cols), and what :func:`rille.stages.terrain.locus.views.look` gives for it, the right image with
+    elevation (rows, cols), and :func:`rille.stages.terrain.locus.views.look` at it, the right image with
     the left one's contrast.
     """
     z, seen = elevation, look(views, lattice, elevation)
@@ -76,7 +76,7 @@ def _gain(seen: OrthoPair) -> float:
 
 
 def _level(seen: OrthoPair, gain: float) -> None:
-    """Scale what the right image shows, in place."""
+    """Scale grey values and slopes of the right image, in place."""
     for values in (seen.right, seen.right_slope):
         values *= np.float32(gain)
 

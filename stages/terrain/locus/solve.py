@@ -57,7 +57,7 @@ class LocusParams(Params):
 
 
 def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) -> Observed:
-    """What the kernel reads of matches, and of the image whose pixels are matched: the left one of ``rig``."""
+    """The kernel's input: matches, and the image whose pixels are matched, the left one of ``rig``."""
     shape = np.shape(matches.column)
     rig.check(shape)
     disparity = np.stack([matches.column, matches.row], axis=-1, dtype=np.float32, casting="unsafe")
@@ -101,9 +101,9 @@ def solve(seen: Observed, cameras: PairCameras, lattice: Lattice, z_range: tuple
 def join(a: Dem, b: Dem) -> Dem:
     """Elevations read from left to right and from right to left: their weighted mean where both are.
 
-    Its variance is the product of both standard deviations (they share the images: no gain) and the square of their
-    difference. What only one direction gave is most often beside an occlusion, and twice
-    as uncertain as it looks. The grey value is that of ``a``.
+    Its variance is the product of both standard deviations (they share the images: no gain), plus the square of the
+    difference. A cell of one direction alone lies mostly beside an occlusion: its standard deviation is doubled. The
+    grey value is that of ``a``.
     """
     za, zb, sa, sb = (v.astype(np.float64) for v in (a.elevation, b.elevation, a.elevation_std, b.elevation_std))
     only_a = np.isfinite(za)

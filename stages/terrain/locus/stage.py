@@ -8,7 +8,7 @@ images, for any orientation of the cameras. The kernel and its equations are in
 (:mod:`rille.stages.terrain.locus.refinement`).
 
 The disparity's part of an elevation's error is ``sigma_d / |ds/dZ|``, with the disparity's own standard deviation at
-the pixel where the matcher gives one; what else makes it uncertain is seen on the surface.
+the pixel where the matcher gives one; :mod:`rille.stages.terrain.locus.uncertainty` has the other parts.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class MatchedPair:
     """``left`` image (rows, cols), grey values, and the ``matches`` of its pixels; a cell needs all four usable
     disparities around its projection.
 
-    ``right`` image, to refine the elevations with (:mod:`rille.stages.terrain.locus.refinement`); None: they stay what
-    the disparity says. ``back``: matches of the right image, to read elevations from as well (:func:`join`); they need
+    ``right`` image, to refine the elevations with (:mod:`rille.stages.terrain.locus.refinement`); None: they stay those
+    of the disparity. ``back``: matches of the right image, to read elevations from as well (:func:`join`); they need
     ``right``.
     """
 
@@ -165,7 +165,7 @@ def _of_ground(rig: Rig, level: Mapping[str, Any]) -> PlaneView:
 
 
 def _limited(params: LocusParams, level: Mapping[str, Any], cell: float) -> LocusParams:
-    """The parameters with the largest standard deviation, where none is given: it follows from the scene."""
+    """The parameters, with the largest standard deviation filled in from the scene where none is given."""
     return params.model_copy(update={"max_sigma": params.max_sigma or max(level.get("max_sigma", 0.0), cell)})
 
 

@@ -9,14 +9,14 @@ times 2 - v where the ground turns away from the left camera, v < 1.
 
 t: the step of Z from cell to cell (RMS of 3 x 3 cells), A: the pixels that a cell covers, so that t / sqrt(A) is the
 step from pixel to pixel; since a position that is wrong by a part of a cell, or of a pixel where cells are finer, is an
-elevation that is wrong by as much of its step. r: what both images still differ by (RMS of 5 x 5 cells), I: the sum of
-the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the differences of
-the whole pair (robust), g: the grey value. In a shadow the gradients are those of noise, so the grey value stands for
-the contrast. m: how far the refinement moved the cells (RMS of 5 x 5 cells): the difference between the elevations by
-the disparity and by the images, which errs the more the fewer pixels those cells cover. u: the unknown share of 7 x 7
-cells; a matching window beside hidden ground is the mean of two surfaces. d: the difference of both directions of
-matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where there was one
-direction.
+elevation that is wrong by as much of its step. r: the remaining difference of both images (RMS of 5 x 5 cells), I: the
+sum of the squared gradients there, so that r^2 / I is what least squares expects of such differences. N: the
+differences of the whole pair (robust), g: the grey value. In a shadow the gradients are those of noise, so the grey
+value stands for the contrast. m: how far the refinement moved the cells (RMS of 5 x 5 cells): the difference between
+the elevations by the disparity and by the images, which errs the more the fewer pixels those cells cover. u: the
+unknown share of 7 x 7 cells; a matching window beside hidden ground is the mean of two surfaces. d: the difference of
+both directions of matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where
+there was one direction.
 
 v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen.
 Where v is small a matching window covers more ground, some of which hides other ground.
@@ -54,12 +54,12 @@ REST_FACTOR = 0.5
 SHADE_FACTOR = 1.9
 """Of noise over grey value: what is left of the ground's contrast in the dark."""
 MIN_AREA_PX = 0.1
-"""Squared pixels: below it a window of cells lies in one pixel, and tells no more or less than a larger one."""
+"""Squared pixels: least A of the term of m; below it all cells of the window lie in one pixel."""
 HOLE_VARIANCE_PX2 = 0.12
 """Squared pixels of disparity where all ground around is unknown."""
 DIFFERENCE_FACTOR = 0.87
 ONE_SIDED_DIFFERENCE_PX = 0.2
-"""Pixels of disparity: difference of both directions where only one of them found something."""
+"""Pixels of disparity: difference of both directions where only one of them gave an elevation."""
 STEP_SIDE_CELLS = 3
 """Side of the window of t."""
 NEAR_SIDE_CELLS = 5

@@ -34,7 +34,7 @@ class SurfaceViews(NamedTuple):
 
 
 class OrthoPair(NamedTuple):
-    """What both images show of each cell (rows, cols) float32; NaN where it is unknown or not inside both images.
+    """Both images at each cell (rows, cols) float32; NaN where it is unknown or not inside both images.
 
     ``left``, ``right``: grey values; ``left_slope``, ``right_slope``: how they change with the elevation, per metre;
     ``scale``: disparity a metre of elevation, pixels; ``area``: pixels of the left image that the cell covers.
@@ -49,14 +49,14 @@ class OrthoPair(NamedTuple):
 
 
 def look(views: SurfaceViews, lattice: Lattice, elevation: Floats | Floats32) -> OrthoPair:
-    """What both images show at the elevations (rows, cols) of the cells, metres, NaN unknown."""
+    """Both images at the elevations (rows, cols) of the cells, metres, NaN unknown."""
     out = OrthoPair(*np.full((len(OrthoPair._fields), *lattice.shape), np.nan, np.float32))
     _look(lattice.xs(), lattice.ys(), np.ascontiguousarray(elevation), lattice.cell, views, out)
     return out
 
 
 def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> Floats32:
-    """Area that the ground (rows, cols) takes in an image over what it would if it were level; 1 where it is unknown.
+    """Area of the ground (rows, cols) in an image over that of level ground; 1 where it is unknown.
 
     Parameters
     ----------

@@ -146,3 +146,14 @@ def test_libraries_read_no_settings_and_no_data_there(folder, tmp_path):
     for name in ("proj.db", "proj.ini"):  # who opens a pipe waits for ever
         os.mkfifo(folder / name)
     assert start(folder, sys.executable, "-P", "-c", COMPILES_AND_WRITES, str(tmp_path / "path.gpkg")) == "2\n"
+
+
+def test_a_user_without_a_home_has_a_folder_for_matplotlib(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
+    monkeypatch.setenv("MPLCONFIGDIR", "")  # so that what is set below is taken back
+    for home, own in ((tmp_path, False), (tmp_path / "nonexistent", True)):
+        monkeypatch.delenv("MPLCONFIGDIR", raising=False)
+        monkeypatch.setenv("HOME", str(home))
+        apart.ignore_settings()
+        assert ("MPLCONFIGDIR" in os.environ) is own
+    assert Path(os.environ["MPLCONFIGDIR"]).parent.is_dir()

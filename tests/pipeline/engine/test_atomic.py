@@ -44,6 +44,17 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
     assert (by_write.value.filename, by_block.value.filename) == (str(tmp_path / "a"), str(tmp_path / "b"))
     assert names(tmp_path) == []
 
+    def closed(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "mkdir", lambda path, **more: more or closed(path))
+    monkeypatch.setattr(Path, "write_bytes", closed)
+    with pytest.raises(PermissionError) as by_write:
+        atomic.write(tmp_path / "a", "one")
+    with pytest.raises(PermissionError) as by_block, atomic.replacing(tmp_path / "b"):
+        pass
+    assert (by_write.value.filename, by_block.value.filename) == (str(tmp_path / "a"), str(tmp_path / "b"))
+
 
 def test_of_two_that_create_a_file_one_does(tmp_path):
     path = tmp_path / "a" / "b"

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ def opencv_error() -> cv2.error:
     [
         (MemoryError("std::bad_alloc"), "RIL-736", "--memory-limit"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/there/file"), "RIL-737", "/there/file"),
+        (OSError(errno.ENOSPC, "full", f"{tempfile.gettempdir()}/tmpx/dem.tif"), "RIL-737", "set TMPDIR"),
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES), "/there"), "RIL-737", "--output"),
         (opencv_error(), "RIL-738", "OpenCV"),
     ],
@@ -52,6 +54,15 @@ def test_a_name_that_is_too_long_is_an_error_of_the_command_line(capsys, words):
         main([*words.split(), "x" * 300, *(["a"] if words == "compare-dem" else [])])
     assert end.value.code == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_link_that_leads_nowhere_and_a_folder_that_was_removed_are_named(tmp_path):
+    (tmp_path / "runs").symlink_to("/scratch/gone")
+    for path in (tmp_path / "runs", tmp_path / "runs" / "mockup" / "1"):
+        with pytest.raises(OSError) as caught:  # noqa: PT011
+            path.mkdir()
+        assert "runs is a link to /scratch/gone, which is missing" in str(translated(caught.value))
+    assert "current folder was removed" in str(translated(FileNotFoundError(errno.ENOENT, "No such file")))
 
 
 def test_other_errors_are_left_as_they_are():

@@ -55,7 +55,9 @@ def lay_out(
     for stage, meta in doubts or [("rig", {})]:
         handles, go_on, _ = [w for w in graph.waiting if w[0][0].stage == stage][-1]
         facts = found | meta if stage == "keyframes" else meta
-        go_on(*(SimpleNamespace(meta=facts) for _ in handles))
+        for handle in handles:
+            handle.error = ValueError() if handle.label in facts.get("failed", ()) else None
+        go_on(*(None if h.error else SimpleNamespace(meta=facts) for h in handles))
     for turn, correction in enumerate([*(cameras or []), [0.0, 0.0, 0.0, 0.0]]):
         asked = {"correction": correction, "corrected": correction}
         facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": asked}
@@ -297,6 +299,19 @@ def test_one_pair_that_does_not_fit_the_rig_of_its_neighbours_is_lost_and_bridge
     assert list(products.world_dem) == [0, 2, 6]
     assert "motion/2-4" in labels(graph, "motion")
     assert "rig" in {h.label for h in graph.nodes if h.index in graph.outdated}
+
+
+def test_a_pair_whose_matches_fit_no_rig_is_lost_where_most_fit() -> None:
+    """The first one, say, whose right image is torn."""
+    impossible = ("ground_frame", GROUND | {"failed": ["ground_frame/0"]})
+    again: dict[str, Any] = {"basic": [0, 3, 5], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6]]}
+    anew = [("keyframes", again | {"displacement": [1.0] * 6, "match_rate": [1.0] * 6}), ("rig", {})]
+    _, products = lay_out([], WHOLE, CHOICE, POSED, doubts=[("rig", {}), impossible, *anew])
+    assert products.trajectory is not None
+    (lost,) = products.trajectory.spec.args["lost"]
+    assert lost["frame"] == 0
+    assert "do not fit each other" in lost["cause"]
+    assert list(products.disparity) == [1, 4, 6]
 
 
 def test_two_pairs_in_a_row_that_do_not_fit_may_be_a_rig_that_moved() -> None:

@@ -154,7 +154,7 @@ def test_a_jump_is_named_as_one_and_not_taken_for_a_unit():
     wrong = true.copy()
     wrong[9, :, 3] = [1e6, 0.0, 0.0]
     (line,) = better_reading(estimated(true, 1), wrong, RigidTransform.identity(), 0.01)
-    assert "jumps by 1e+06 m against the trajectory behind 9 of its 24 poses" in line
+    assert "jumps by 1e+06 m against the trajectory after 9 of its 24 poses" in line
     assert "unit" not in line
 
 
@@ -165,7 +165,7 @@ def test_a_jump_from_which_on_truth_stays_off_is_named(much: float, seed: int) -
     wrong = true.copy()
     wrong[9:, :, 3] += [0.0, much, 0.0]
     (line,) = better_reading(true, wrong, RigidTransform.identity(), 0.01)
-    assert f"jumps by {much:g} m against the trajectory behind 9 of its 24 poses" in line
+    assert f"jumps by {much:g} m against the trajectory after 9 of its 24 poses" in line
 
 
 def test_a_mount_that_is_inverted_is_named_as_that() -> None:

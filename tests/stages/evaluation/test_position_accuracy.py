@@ -274,7 +274,7 @@ def test_a_jump_is_named_with_its_row(width, rows):
     noisy = at(MOMENTS) + 0.01 * np.random.default_rng(0).standard_normal((80, 3))
     [line] = position_accuracy(cameras(noisy), TruePositions(places)).warnings
     assert line.startswith("true positions jump by ")
-    assert "behind 30 of 80 of them" in line
+    assert "after 30 of 80 of them" in line
 
 
 @pytest.mark.parametrize("turned", [False, True])

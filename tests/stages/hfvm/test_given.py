@@ -9,7 +9,6 @@ from matching_scenes import Texture
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity, has, matched
-from rille.stages.hfvm import prior
 from rille.stages.hfvm.given import check, hfvm_given_stage
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
@@ -63,8 +62,7 @@ def foreign(off=0.0):
 
 def checked(images, u, **params):
     left, right = (pyramid.build(image, PyramidParams(), None) for image in images)
-    given = prior.known_beforehand((u, np.zeros_like(u)), SHAPE)
-    return check(left, right, given, HfvmParams(**params))
+    return check(left, right, u, HfvmParams(**params))
 
 
 def right_pixels():
@@ -169,5 +167,5 @@ def test_a_tiny_pair_has_no_coarser_level():
     left, right = (pyramid.build(image, PyramidParams(), None) for image in images)
     assert left.levels == 1
     u = np.full((12, 14), FAR, np.float32)
-    arrays = check(left, right, prior.known_beforehand((u, 0 * u), u.shape), HfvmParams())
+    arrays = check(left, right, u, HfvmParams())
     assert {array.shape for array in arrays.values()} == {(12, 14)}

@@ -4,11 +4,9 @@ import cv2
 import numpy as np
 import pytest
 from matching_scenes import pair, seen
-from raising import raises
 
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
-from rille.stages.hfvm import plane, prior
 from rille.stages.hfvm.finest import isolated
 from rille.stages.hfvm.matcher import How
 from rille.stages.hfvm.params import HfvmParams
@@ -141,57 +139,6 @@ def test_patches_of_chance_go_where_nearly_all_are_small_and_stay_beside_a_large
     keep[110:150, 60:160] = True
     assert not isolated(u, keep, 40).any()
     assert not isolated(u, keep, 1).any()
-
-
-def test_prior_chooses_among_repetitions_and_is_refined():
-    # A row of equal posts: any multiple of 16 columns fits as well, and the search takes the least.
-    y, x = np.indices((120, 200), dtype=np.float64)
-    posts = lambda x: 128 + 40 * np.sin(2 * np.pi * x / 16) + 25 * np.sin(2 * np.pi * y / 23)  # noqa: E731
-    left, right = posts(x), posts(x + 32.4)
-    inside = np.s_[20:100, 70:180]
-    prior = np.full(left.shape, -31.0, np.float32), np.zeros(left.shape, np.float32)
-    plain, led = match(left, right), match(left, right, prior=prior)
-    assert np.nanmedian(np.abs(plain.column_disparity[inside] + 32.4)) > 8
-    ok = matched(led.validity)[inside]
-    assert ok.mean() > 0.8
-    assert np.median(np.abs(led.column_disparity[inside] + 32.4)[ok]) < 0.1
-
-
-def test_exact_and_partial_prior_change_little_on_a_plain_pair():
-    left, right, u, v = pair(lambda x, y: (-9.0 + 3 * np.sin(x / 30), 1.0), noise=1.0)
-    plain = match(left, right)
-    prior = np.where(np.arange(u.shape[1]) < 90, u, np.nan), np.broadcast_to(v, u.shape)
-    led = match(left, right, prior=prior)
-    both = matched(plain.validity) & matched(led.validity)
-    assert both.sum() > 0.97 * matched(plain.validity).sum()
-    assert np.percentile(np.abs(plain.column_disparity - led.column_disparity)[both], 95) < 0.05
-
-
-def test_prior_is_carried_over_to_the_aligned_image():
-    left, right, u, v = pair(lambda x, y: (10.0 - 0.55 * y, 0.01 * x), (160, 200), (160, 220), noise=1.0)
-    led = match(left, right, prior=(u, v))
-    assert led.unlike.aligned
-    good, complete = share_within(led, u, v, right.shape, 0.5)
-    assert good > 0.97
-    assert complete > 0.93
-
-
-def test_prior_of_another_size_or_beyond_all_bounds():
-    left, right, *_ = pair(lambda x, y: (-5.0, 0.0))
-    with raises("RIL-348"):
-        match(left, right, prior=(np.zeros((3, 3)), np.zeros((3, 3))))
-    absurd = np.full(left.shape, 1e9), np.full(left.shape, -np.inf)
-    np.testing.assert_array_equal(match(left, right, prior=absurd).validity, match(left, right).validity)
-
-
-def test_prior_that_a_plane_leads_beyond_all_bounds_is_unknown():
-    # A plane whose horizon lies 16000 px to the right, and given displacements that end just before it.
-    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0 / 16000.0, 0.0, 1.0]])
-    ends = np.full((64, 64), 15900.0, np.float32)
-    away = np.linalg.inv(plane.to_original(horizon, ends.shape))
-    led, near = (prior.bounded(*plane.carried(away, u, 0 * u)) for u in (ends, 0 * ends))
-    np.testing.assert_array_less(np.abs(led.u[np.isfinite(led.u)]), 16000)
-    assert np.isfinite(near.u).all()
 
 
 def test_progress_grows_from_nothing_to_all():

@@ -339,7 +339,7 @@ class TestLookup:
         rng = np.random.default_rng(0)
         true = rng.uniform(-0.5, 0.5, 20000)
         found = true - 0.1 * np.sin(2 * np.pi * true)
-        even = paper.even(found, learn(found))
+        even = paper.equalized(found, learn(found))
         counts, _ = np.histogram(even, 10, (-0.5, 0.5))
         assert np.ptp(np.histogram(found, 10, (-0.5, 0.5))[0]) > 1000
         # 2000 a bin, five standard deviations, and linear interpolation inside sixteenths.
@@ -347,13 +347,13 @@ class TestLookup:
 
     def test_table_maps_the_interval_onto_itself_oddly(self):
         x = np.linspace(-0.5, 0.5, 101)
-        y = paper.even(x)
+        y = paper.equalized(x)
         assert (y[0], y[50], y[-1]) == (-0.5, 0.0, 0.5)
         assert (np.diff(y) > 0).all()
         np.testing.assert_allclose(y, -y[::-1], atol=1e-7)
 
     def test_no_sample_no_change(self):
-        np.testing.assert_allclose(paper.even([0.3], learn([])), [0.3], atol=1e-6)
+        np.testing.assert_allclose(paper.equalized([0.3], learn([])), [0.3], atol=1e-6)
 
     def test_default_table_is_what_textured_noise_teaches(self):
         p = HfvmParams(preset="paper", top_columns=0.05, top_rows=0.05)

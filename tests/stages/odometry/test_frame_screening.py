@@ -37,7 +37,7 @@ def test_a_frame_that_neither_neighbour_is_found_in_is_bridged_if_the_bridge_hol
     alone = {(2, 3): 0.05, (3, 4): 0.04}
     assert found(alone).asks["bridges"] == [(2, 4)]
     out = found(alone | {(2, 4): 0.5})
-    assert out.lost == {3: "not found in its neighbours: 5% of its pixels match the frame before, 4% the one behind"}
+    assert out.lost == {3: "not found in its neighbours: 5% of its pixels match the frame before, 4% the one after"}
     # nothing speaks against the frame itself where the bridge is as bad: the camera may have jumped
     assert not found(alone | {(2, 4): 0.05}).lost
 

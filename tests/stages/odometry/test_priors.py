@@ -225,7 +225,7 @@ def test_positions_that_jump_and_stay_there_are_refused_as_that():
     (line,) = (line for line in adjusted(segments, before, given).meta["warnings"] if line.startswith("["))
     assert "not used" in line
     x, y, _ = given["positions"]["positions"][14]
-    assert f"they jump by 7.8 m behind ({x:.2f}, {y:.2f})" in line
+    assert f"they jump by 7.8 m after ({x:.2f}, {y:.2f})" in line
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.03])

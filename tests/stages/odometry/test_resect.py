@@ -483,6 +483,21 @@ def test_of_two_motions_that_many_landmarks_show_none_is_taken(near, far, moved,
     assert words in line
 
 
+@pytest.mark.parametrize(("stand", "posed"), [(20, False), (40, True)])
+def test_of_a_crowd_no_few_that_agree_make_a_pose(stand, posed):
+    rng = np.random.default_rng(37)
+    step = RigidTransform(rotation_exp([0, 0.01, 0]), np.array([0.0, 0, 0.6]))
+    landmarks = scene(rng, 100)
+    points = np.stack([seen(T, landmarks) for T in (RigidTransform.identity(), step)], 1).astype(np.float32)
+    points[stand:, 1] += rng.uniform(-30, 30, (100 - stand, 2))
+    found = segment_poses(points, landmarks, RigidTransform.identity(), [4, 5])[1]
+    if posed:
+        np.testing.assert_allclose(found.poses[1], step.matrix34, atol=1e-4)
+        return
+    assert np.isnan(found.poses[1]).all()
+    assert found.facts[1]["lost"].startswith("only 20 of 100 landmarks agree with one pose")
+
+
 @pytest.mark.parametrize(("near", "far", "moved"), [(0, 12, 88), (15, 0, 85), (0, 86, 14)])
 def test_a_vehicle_ahead_and_few_that_pass_leave_the_motion_as_it_is(near, far, moved):
     found, step = carried(near, far, moved)

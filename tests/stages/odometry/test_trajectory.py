@@ -1,8 +1,10 @@
 """The scan over segments against composing by hand, with tilted local frames; covariance against sampling."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
@@ -221,6 +223,23 @@ def test_the_vertical_of_a_later_pair_is_carried_back_where_the_first_has_none()
     assert blind.meta["verticals"] == ["none"]
     assert "frames 0-4" in blind.meta["warnings"][0]
     np.testing.assert_array_equal(np.asarray(blind["poses"])[0], unlevelled.matrix34)
+
+
+@pytest.mark.parametrize(
+    ("tilt", "source", "told"), [(8.0, "ground plane", 1), (3.0, "ground plane", 0), (8.0, "pitch", 0)]
+)
+def test_ground_of_another_pair_that_contradicts_the_vertical_is_told(tilt, source, told):
+    """Of matches that are bad a plane may be ground that is tilted by many degrees."""
+    T = RigidTransform.identity()
+    turned = RigidTransform(rotation_exp([math.radians(tilt), 0, 0]), np.zeros(3))
+    segments = [resected([4, 5], [T, T]), resected([5, 6], [turned, turned])]
+    levels = [Bundle({}, {"T_local_left": one.to_list(), "source": source}) for one in (T, turned)]
+    inputs = {"segments": segments, "levels": levels}
+    found = trajectory_stage.run(NoParams(), {"frames": [4, 5, 6]}, inputs)
+    assert len(found.meta["warnings"]) == told
+    assert all(
+        "ground of 1 of 2 pairs, first pair 5, the vertical is off by up to 8" in w for w in found.meta["warnings"]
+    )
 
 
 def test_one_pair_behind_a_lost_frame_has_the_pose():

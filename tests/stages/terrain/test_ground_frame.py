@@ -196,6 +196,17 @@ def test_where_no_plane_dominates_a_surface_may_be_stated(up: list[float] | None
     facts = level(column, row, usable, RIG, PARAMS, VerticalHint(up=up))
     assert facts["no_ground"].endswith("state its depth by ground_frame.reference_height")
     assert "world.up" not in facts["no_ground"]
+    assert "lowest quarter" not in facts["no_ground"]
+
+
+@pytest.mark.parametrize("down", [1, -1])
+def test_ground_that_is_hidden_asks_for_a_look_at_the_images(down: int) -> None:
+    """Dirt on a lens, or an image that is torn below: walls and trees are all that is matched."""
+    column, row, usable = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 2.0, 9.0)))
+    column = column + np.random.default_rng(0).normal(0.0, 0.8 * abs(column[usable]).max(), column.shape)
+    usable[::down][len(usable) // 2 :] = False
+    facts = level(column, row, usable, RIG, PARAMS, VerticalHint(up=[0.0, -float(down), 0.0]))
+    assert "; 0% of the lowest quarter of the left image is matched: look there at both images" in facts["no_ground"]
 
 
 def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
@@ -307,6 +318,22 @@ def test_images_that_are_mirrored_top_to_bottom_show_ground_above_the_cameras(pi
         inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
         facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
         assert facts.get("warnings") == ([level_stage.HANGING] if warned else None)
+
+
+@pytest.mark.parametrize(("rows", "warned"), [(50, True), (9, False)])
+def test_a_few_eaves_above_the_cameras_are_no_ground_of_mirrored_images(rows: int, warned: bool) -> None:
+    cam = Camera(350.0, 350.0, 199.5, 64.5, 400, 130)
+    rig = Rig(cam, cam, RigidTransform(np.eye(3), [-0.54, 0.0, 0.0]))
+    column, row, usable = (a[::-1].copy() for a in disparity(rig, pitched(0.0), plane(0.0, 0.0, -1.65)))
+    random = np.random.default_rng(0)
+    column[: 60 - rows] = -random.uniform(5.0, 60.0, (60 - rows, 400))
+    column[60:], row[60:], usable[60:] = -random.uniform(5.0, 60.0, (70, 400)), 0.0, True
+    maps = {"column_disparity": column.astype("f4"), "row_disparity": -row.astype("f4")}
+    maps |= {"validity": np.where(usable, Validity.MATCHED, 0).astype(np.uint8)}
+    maps |= {"backmatch_error": np.zeros(usable.shape, "f4")}
+    inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
+    facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
+    assert ("warnings" in facts) == warned
 
 
 def test_a_drone_that_tilts_backwards_sees_no_ground_above() -> None:
