@@ -1,1 +1,1 @@
-"""Where stereo sequences come from. This package imports nothing on its own."""
+"""Sources of stereo sequences. This module imports nothing."""

@@ -1,10 +1,10 @@
 """ROS 1 and ROS 2 bags and mcap files with the images of two cameras and their ``camera_info``.
 
 Pairs are images of nearest ``header.stamp``. Images of a topic with a word in its name that begins with ``rect`` are
-rectified: their camera is ``P``; of others it is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras
-say how they stand to each other (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry count where
-``/tf_static`` says how their frame stands to the left camera's: the IMU gives the vertical and rotations, odometry
-predicts.
+rectified: their camera is ``P``; that of others is ``K`` with the distortion ``D``, and ``R`` and ``P`` of both cameras
+give their relative pose (REP 104 and ``sensor_msgs/msg/CameraInfo``). An IMU and wheel odometry are used if
+``/tf_static`` has the transform from their frame to the left camera's: the IMU gives the vertical and rotations,
+odometry predictions.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ Used = TypeVar("Used")
 
 @dataclass(frozen=True)
 class TakenImage:
-    """One image message: when it was recorded, its digest, width, height and bits of its image, and the frame of its
-    camera; whether its driver has ``stamped`` it."""
+    """One image message: time of its recording, its digest, width, height and bits of its image, and the frame of its
+    camera; ``stamped``: whether its driver has set a stamp."""
 
     at: int
     sha256: str
@@ -69,22 +69,22 @@ class TakenImage:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is called as bags are."""
+    """Whether a path looks like a bag."""
     about = path / "metadata.yaml"
-    if not os.path.isfile(about):  # not pathlib's, which raises where a name is too long
+    if not os.path.isfile(about):  # not pathlib's, which raises for a name that is too long
         return os.path.isfile(path) and path.suffix in SUFFIXES
     with open_regular(about, "bag's metadata", sys.maxsize) as file:
         return b"rosbag2_bagfile_information" in file.read(SMALL)
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:
-    """The sequence of a bag, or None where the path is none.
+    """The sequence of a bag; None if the path is none.
 
     Raises
     ------
     InputError
-        The package that reads bags is missing, the bag cannot be read, holds no two image topics that belong together
-        or several, or no cameras are known, or no two images are of one time.
+        The package that reads bags is missing, the bag cannot be read, does not have exactly two image topics that
+        belong together, or no cameras are known, or no two images are simultaneous.
     """
     return open_bag(path.resolve(), number) if is_bag(path) else None
 
@@ -100,9 +100,9 @@ def open_bag(
     Parameters
     ----------
     topics : those of the left and right images, with a comma between them.
-    optics_of : cameras before images of some sizes; by default those of ``camera_info``, or, where there is none, of a
+    optics_of : returns the cameras of images of some sizes; by default those of ``camera_info``, or else of a
         calibration file beside the bag.
-    tolerance : s; how far the stamps of a pair may be apart; None: see :func:`rille.datasets.images.pairing.join`.
+    tolerance : s; largest difference of the stamps of a pair; None: see :func:`rille.datasets.images.pairing.join`.
     """
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
@@ -176,7 +176,7 @@ def _messages(reader: Any, topic: str) -> Iterator[tuple[int, bytes, Any]]:
 
 
 def _stamp(message: Any) -> int:
-    """Time stamp of a message, ns; 0 where its driver has not set one: then the time of its recording counts."""
+    """Time stamp of a message, ns; 0 if its driver has not set one: then the time of its recording counts."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
@@ -188,7 +188,7 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
         stamp = stamped or at
         size = bag.depth(message, f"image {stamp} of {topic} in {path}")
         taken = TakenImage(at, hashlib.sha256(data).hexdigest(), size, message.header.frame_id, bool(stamped))
-        if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message is no other image
+        if found.setdefault(stamp, taken).sha256 != taken.sha256:  # a copy of the message does no harm
             text = f"{path}: two images of {topic} have the stamp {stamp}"
             raise InputError("RIL-993", text, remedy="record header.stamp as the time when an image was taken")
     _check_clock(found, f"{path} {topic}")
@@ -196,13 +196,13 @@ def _images(reader: Any, path: Path, topic: str) -> dict[int, TakenImage]:
 
 
 def _check_clock(found: Mapping[int, TakenImage], where: str) -> None:
-    """Refuse images, in the order of their recording by stamp, whose clock was set back meanwhile.
+    """Refuse images whose clock was set back meanwhile; ``found``: images by stamp, in order of their recording.
 
-    An image that is written late is later than its neighbours; after a clock was set back all are.
+    Single images may be written late; after a clock was set back all later ones are.
     """
     stamps, late = np.array(list(found)), np.array([one.at - stamp for stamp, one in found.items()])
     for k in 1 + np.flatnonzero(np.diff(stamps) < 0):
-        # 3: images from which on a clock that was set is told from images that are written late.
+        # 3: fewest images that show a clock that was set back; fewer may be written late.
         if len(late) - k >= 3 and late[k:].min() > late[:k].max():
             text = f"{where}: header.stamp goes back by {(stamps[k - 1] - stamps[k]) / 1e9:.3g} s at image {k}"
             remedy = "its clock was set meanwhile: cut the bag there, and take each part as a sequence"
@@ -212,7 +212,7 @@ def _check_clock(found: Mapping[int, TakenImage], where: str) -> None:
 def _joined(
     path: Path, topics: tuple[str, str], taken: Sequence_[Mapping[int, TakenImage]], tolerance: float | None
 ) -> tuple[tuple[list[int], list[int]], list[str]]:
-    """Stamps of the left and of the right images of all pairs, in order, and what is left out."""
+    """Stamps of the left and of the right images of all pairs, in order, and warnings about images left out."""
     left, right = sorted(taken[0]), sorted(taken[1])
     joined = join([stamp / 1e9 for stamp in left], [stamp / 1e9 for stamp in right], tolerance)
     if not joined.places:
@@ -234,7 +234,7 @@ def _joined(
 
 
 def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, np.ndarray]:
-    """Cameras of the image topics, and the rotation from the left one's frame to its images'."""
+    """Cameras of the image topics, and the rotation from the left camera's frame to that of its images."""
     infos = [_info(reader, path, topic) for topic in topics]
     missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
     if missing is not None:
@@ -266,7 +266,7 @@ def _beside(topic: str) -> str:
 
 
 def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
-    """Fields of the ``camera_info`` of an image topic; messages whose P is 0, as of no calibrated camera, do not count.
+    """Fields of the ``camera_info`` of an image topic; messages of uncalibrated cameras, with P = 0, do not count.
 
     ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     """
@@ -305,24 +305,24 @@ def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[Calibrate
     return opencv.single(fields, path)[0], turned
 
 
-# -- movement ----------------------------------------------------------------------------------------------------------
+# -- motion ------------------------------------------------------------------------------------------------------------
 
 
 def _movement(
     reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: np.ndarray
 ) -> tuple[Inertial, Reckoned, list[str]]:
-    """What IMU and odometry say of each frame, and what cannot be used."""
+    """Records of IMU and odometry at each frame, and warnings about unusable ones."""
     frames, warnings = _static(reader), list[str]()
-    # frame_id names the camera as it is mounted; a rectified image is turned by R against it.
+    # frame_id is the frame of the mounted camera; a rectified image is turned by R against it.
     T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
 
     def used(kind: str, place: Callable[[Any], str], use: Callable[..., Used], otherwise: Used) -> Used:
-        """What ``use`` makes of the only topic of a kind; ``otherwise`` where it cannot be used, which costs it alone.
+        """Result of ``use`` for the only topic of a kind; ``otherwise``, with a warning, if it cannot be used.
 
         ``use`` takes the topic's name, its messages with their times, and the left image's pose in its frame.
         """
         topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
-        # By stamp, for drivers repeat messages.
+        # By stamp, because drivers repeat messages.
         messages = {_stamp(m) or at: m for topic in topics[:1] for at, _, m in _messages(reader, topic)}
         if len(topics) > 1 or (topics and not messages):
             warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
@@ -336,7 +336,7 @@ def _movement(
             if T_sensor_camera is not None:
                 moments = seconds(stamps, f"{path} {topics[0]}", unit="ns")
                 return use(topics[0], moments, [messages[stamp] for stamp in stamps], T_sensor_camera @ T_camera_image)
-        except (InputError, ValueError) as error:  # ValueError: quaternions of zeros, forces that are no numbers
+        except (InputError, ValueError) as error:  # ValueError: quaternions of zeros, forces of NaN
             why = error.message if isinstance(error, InputError) else str(error)
         warnings.append(warning("RIL-951", f"{path}: {topics[0]} is not used: {why}"))
         return otherwise
@@ -350,7 +350,7 @@ def _movement(
 
     def reckoned(topic: str, moments: tuple[float, ...], messages: list[Any], T_base_left: RigidTransform) -> Reckoned:
         poses = tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages)
-        # s; odometry is interpolated over no longer gap
+        # 0.5 s: longest gap over which odometry is interpolated.
         between = interpolate(TimedPoses(moments, poses, topic), times, 0.5)
         return tuple(None if T is None else T @ T_base_left for T in between)
 
@@ -371,10 +371,10 @@ def _static(reader: Any) -> dict[str, dict[str, RigidTransform]]:
 
 
 def _between(frames: Mapping[str, Mapping[str, RigidTransform]], a: str, b: str) -> RigidTransform | None:
-    """``T_a_b`` along fixed transforms; None where none leads there."""
+    """``T_a_b`` along fixed transforms; None if they do not connect the frames."""
     a, b = a.lstrip("/"), b.lstrip("/")
     known = {a: RigidTransform.identity()}
-    # Breadth first: transforms may form a graph with circles, in which the shortest way is as good as any.
+    # Breadth first, since the graph of transforms may have cycles.
     todo = [a]
     for one in todo:
         for other, T in frames.get(one, {}).items():

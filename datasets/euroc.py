@@ -1,12 +1,12 @@
 """Visual-inertial recordings in the layout of EuRoC (Burri et al. 2016, doi:10.1177/0278364915620033).
 
-``mav0/`` holds a folder a sensor: ``cam0`` (left) and ``cam1`` (right) with ``sensor.yaml``, perhaps ``data.csv`` (time
-stamp, file name), and ``data/``, whose files are named by their time stamps; perhaps ``imu0``, and truth. Each
-``sensor.yaml`` says by ``T_BS`` how its sensor stands in the body. The folder is read by the manifest
-(:mod:`rille.datasets.manifest`) that says so.
+``mav0/`` holds a folder for each sensor: ``cam0`` (left) and ``cam1`` (right) with ``sensor.yaml``, perhaps
+``data.csv`` (time stamp, file name), and ``data/``, whose files are named by their time stamps; perhaps ``imu0``, and
+truth. ``T_BS`` in each ``sensor.yaml`` is the pose of its sensor in the body. The folder is opened by a manifest
+(:mod:`rille.datasets.manifest`).
 
-Truth is only assessed. The IMU gives the rotation between frames and, where the body rests or moves unaccelerated, the
-vertical; both start values that a reconstruction can do without, so that a recording without it is fine.
+Truth serves for comparison alone. The IMU gives the rotation between frames and, while the body rests or moves
+unaccelerated, the vertical; both are optional start values.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TRUTH: Mapping[str, bool] = {
     "vicon0": False,
     "leica0": False,
 }
-"""Folders of true poses (the last: positions), the best first, and whether they are the body's where no ``T_BS`` is
+"""Folders of true poses (the last: positions), the best first, and whether they are the body's if no ``T_BS`` is
 stated."""
 
 IMU = "imu0"
@@ -46,12 +46,12 @@ FORMS = (("FOLDER", "EuRoC: mav0/cam0, mav0/cam1, each with sensor.yaml and data
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:
-    """The sequence of a folder (that of ``mav0``, or ``mav0`` itself), or None where it has not this layout.
+    """The sequence of a folder (that of ``mav0``, or ``mav0`` itself); None if it has another layout.
 
     Raises
     ------
     InputError
-        What is there cannot be used.
+        The files cannot be used.
     """
     path = path.resolve()
     folder = path / "mav0" if (path / "mav0").is_dir() else path
@@ -64,8 +64,8 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     truth, imu, warnings = sensors(folder)
     listed = (folder / "cam0" / "data.csv").is_file()
     stamped = all(stamp_of(image.stem) for image in (folder / "cam0" / "data").iterdir())
-    # Drones and hands carry short baselines through rooms and halls: 3 m away, 0.2 px of disparity are 4 cm of depth
-    # at 0.11 m, so that finer cells stay empty. No vehicle, and no rule for the choice of pairs, suits them all.
+    # Baselines are short, in rooms and halls: 3 m away, 0.2 px of disparity are 4 cm of depth with 0.11 m, so that
+    # finer cells stay empty. There is no vehicle, nor a rule for the choice of pairs, for all of them.
     manifest = Manifest(
         name=derived_name(folder.parent.name if folder.name == "mav0" else folder.name),
         images=Images(left="cam0/data/*", right="cam1/data/*", pair="nearest" if stamped else "auto"),
@@ -87,7 +87,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
 
 
 def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
-    """Truth and IMU with the left camera's place in their frames, and warnings of those whose place is not known."""
+    """Truth and IMU with the left camera's pose in their frames, and warnings about those of unknown pose."""
     left = read_cameras(folder / "cam0" / "sensor.yaml")[0]
     if left.T_camera_reference is None:
         text = f"{folder / 'cam0'} does not say where the camera stands in the body (T_BS): truth and IMU are not used"
@@ -105,14 +105,14 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
         if name == IMU:
             imu = Imu(file=file, T_imu_left=pose)
         else:
-            # s; truth is interpolated over no longer gap: at 5 m/s^2 the straight line is then 1.4 cm off at most
+            # 0.15 s: longest gap over which truth is interpolated; at 5 m/s^2 a straight line errs by at most 1.4 cm.
             source = f"{name}, interpolated to the images' times"
             truth = Truth(file=file, T_body_left=pose, max_gap=0.15, source=source)
     return truth, imu, warnings
 
 
 def body_pose(folder: Path) -> RigidTransform | None:
-    """``T_BS`` of a sensor: its pose in the body; None where its folder does not say."""
+    """``T_BS`` of a sensor: its pose in the body; None if its folder does not state it."""
     path = folder / "sensor.yaml"
     if not path.is_file():
         return None

@@ -1,4 +1,4 @@
-"""A sequence as plain files, so that other tools can run on it; Rille reads the folder back as a sequence."""
+"""Export a sequence as plain files for other tools; Rille reads the folder back as a sequence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rille.stages.geometry.lattice import Lattice
 Materialise = Callable[[Source], Bundle]
 
 README = "export_readme.txt"
-"""File beside this module: what the folder says of itself, with places for the sequence's name, size and notes."""
+"""File beside this module: text of the folder's readme, with fields for the sequence's name, size and notes."""
 
 
 def export(sequence: Sequence, directory: Path, materialise: Materialise) -> Path:
@@ -30,16 +30,15 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise) -> Pat
 
     Parameters
     ----------
-    sequence : what to write.
+    sequence : to write.
     directory : folder to make; it must not exist yet, or be empty.
-    materialise : gives the arrays of a source (from a cache, or by running its stage); also true disparity and DEM of
-        the basic pairs by the sequence's own stride, where it has them.
+    materialise : returns the arrays of a source (from a cache, or by running its stage); also true disparity and DEM of
+        the basic pairs by the sequence's own stride, if it has them.
 
     Raises
     ------
     InputError
-        The folder has something in it, or cannot be made; or the images have lens distortion, which the files that
-        are written have no place for.
+        The folder is not empty, or cannot be made; or the images have lens distortion, which the files cannot hold.
     """
     if sequence.lenses:
         text = f"the images of {sequence.name} have lens distortion, which calib.txt cannot say"
@@ -48,14 +47,14 @@ def export(sequence: Sequence, directory: Path, materialise: Materialise) -> Pat
         raise InputError("RIL-165", f"{directory} exists, and is no empty folder", remedy="name another")
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the folder to be made: a rename in one step needs the same file system.
+        # Beside the folder to be made, because a rename needs the same file system.
         part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
     except OSError as error:
         text = f"{directory} cannot be made: {error.strerror}"
         raise InputError("RIL-166", text, remedy="name another folder") from error
     try:
         _write(sequence, part, materialise)
-        # mkdtemp makes it readable for its owner alone.
+        # mkdtemp makes the folder readable for its owner alone.
         part.chmod(0o755)
         part.replace(directory)
     except BaseException:
@@ -106,7 +105,7 @@ def _write_png(path: Path, image: Any) -> None:
 
 
 def _write_rows(path: Path, rows: Iterable[Iterable[float]]) -> None:
-    # 17 digits give back every float64 to the bit.
+    # 17 digits keep every float64 to the bit.
     path.write_text("".join(" ".join(f"{v:.17g}" for v in row) + "\n" for row in rows), encoding="utf-8")
 
 
@@ -130,7 +129,7 @@ def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:
 
 
 def _write_dem(sequence: Sequence, folder: Path, frame: int, materialise: Materialise) -> None:
-    """The exact DEM of the evaluation window, on cells at integer multiples of the cell size, where it is known."""
+    """Write the exact DEM of the evaluation window, on cells at integer multiples of the cell size, if it is known."""
     T_truth_left = None if sequence.truth is None else sequence.truth[frame]
     if sequence.truth_dem is None or T_truth_left is None or sequence.evaluation_window is None:
         return

@@ -6,7 +6,7 @@ from rille.stages.core.declare import Facts
 
 
 class ImageFacts(Facts):
-    """Number of the ``frame``, and the ``camera``: ``left`` or ``right``. ``damage``: why the image is empty, if its
+    """Number of the ``frame``, and the ``camera``: ``left`` or ``right``. ``damage``: reason for an empty image, if its
     file is damaged."""
 
     frame: int

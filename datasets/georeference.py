@@ -1,4 +1,4 @@
-"""Where on Earth (or another body) a sequence's world frame lies: a projected CRS, an origin and a heading."""
+"""Georeference of a sequence's world frame on Earth or another body: a projected CRS, an origin and a heading."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORMS = re.compile(
     r"|(PROJ|PROJECTED|GEOG|GEOD|GEODETIC|GEOGRAPHIC|GEOC|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
     r"|(WGS84|WGS72|NAD27|NAD83|CRS84)$"
 )
-"""How a CRS begins which GDAL does not look for in a file of that name."""
+"""Beginnings of CRS texts that GDAL does not look for in a file of that name."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Georeference:
 
     ``origin``: easting, northing, height (m) of the world's origin, the first left camera's centre. ``azimuth``:
     direction of the world's y axis (the first optical axis, projected to the horizontal), radians clockwise from grid
-    north. World metres are taken as metres of the grid: a projection's scale (0.9996 to 1.001 in UTM) is not applied.
+    north. World metres are used as metres of the grid: a projection's scale (0.9996 to 1.001 in UTM) is not applied.
     """
 
     crs: str
@@ -58,15 +58,15 @@ class Georeference:
 
 
 def _refuse_places(crs: str) -> None:
-    """Refuse, by a ValueError, what GDAL might read a CRS from: a file, or a pipe, or an address in the net."""
+    """Refuse, by a ValueError, texts by which GDAL might read a file, a pipe, or an address in the net."""
     if not FORMS.match(crs):
         raise ValueError("no file or address is read: give the CRS itself, e.g. EPSG:32633")
 
 
 def are_degrees(crs: str, origin: Sequence[float]) -> bool:
-    """Whether an origin looks like longitude and latitude: near that of a CRS of a register no vehicle drives.
+    """Whether an origin looks like longitude and latitude: in registered CRS it would be far from any vehicle.
 
-    The origin of a CRS of one's own may lie anywhere.
+    In a CRS of one's own the origin may lie anywhere.
     """
     from rasterio.crs import CRS
 
@@ -75,7 +75,7 @@ def are_degrees(crs: str, origin: Sequence[float]) -> bool:
 
 
 def metric_crs(text: str) -> str:
-    """The CRS as it is written; ValueError where it is unknown, not projected or not in metres."""
+    """The CRS as given; ValueError if it is unknown, not projected or not in metres."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
 

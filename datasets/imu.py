@@ -2,10 +2,10 @@
 
 Rates are integrated exactly for a rate that is constant between two samples (their mean): R <- R exp(w dt), Savage
 (1998), doi:10.2514/2.4228, without the coning terms, which matter to inertial navigation and not to frames of a tenth
-of a second. The gyroscope's bias is what it reads where the sensor rests. An accelerometer measures specific force, in
-rest the reaction to gravity: it points **up**. Single samples of a sensor on a running engine are worthless (1 m/s^2 of
-vibration), so that the force is averaged over two seconds around each frame, turned by the gyroscope into the
-frame's moment, and used only where it is steady, as large as gravity, and the sensor hardly turns.
+of a second. The gyroscope's bias is its reading at rest. An accelerometer measures specific force, at rest the reaction
+to gravity: it points **up**. Single samples of a sensor on a running engine are useless (1 m/s^2 of vibration), so the
+force is averaged over two seconds around each frame, turned by the gyroscope to the attitude at the frame, and used
+only if it is steady, as large as gravity, and the sensor hardly turns.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation
 Up = tuple[float, float, float] | None
 
 STEADY_RATE = 0.02
-"""rad/s, greatest standard deviation of means of the rate over 0.1 s where the sensor rests; rotors that idle shake it
-by 0.007."""
+"""rad/s, greatest standard deviation of means of the rate over 0.1 s at rest; idle rotors cause 0.007."""
 
 BIN = 0.1
-"""s; means over it are free of vibration."""
+"""s; means over this time are free of vibration."""
 
 HALF_WINDOW = 1.0
-"""s; the force is averaged over as much before and after a frame, at an end of the record over one side. In a drone's
-flight one frame in twenty passes, 0.6 degrees off in the median and 2 at most; half the window triples that."""
+"""s; the force is averaged over this time before and after a frame, at an end of the record on one side. In a drone's
+flight one frame in twenty passes, with errors of 0.6 degrees in the median and at most 2; half the window triples that.
+"""
 
 GYROSCOPE = re.compile(r"(.*[./])?(gyr|g_?[xyz]\b|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
-"""How names of columns begin, behind the path of a field of a message of ROS."""
+"""Beginnings of column names, after the path of a field of a ROS message."""
 
 ORDER = ([1, 2, 3], [4, 5, 6])
-"""Columns of rates and forces where no names tell; times are before them."""
+"""Columns of rates and forces without names; times come first."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class Inertial:
     Attributes
     ----------
     attitude : R_reference_left row by row, the reference being the sensor's frame at its first sample in use; None
-        where the record does not reach or is cut off from the longest unbroken part by a gap.
-    up : unit vector of up in the left camera's frame; None where the force is not gravity's reaction.
-    axes : R_imu_left, by which rates and forces came into the camera's frame.
-    warnings : what is missing or suspicious, one line each.
-    notes : what was assumed.
+        outside of the record, or if a gap separates it from the longest unbroken part.
+    up : unit vector of up in the left camera's frame; None where the force is not the reaction to gravity.
+    axes : R_imu_left, which turned rates and forces to the camera's frame.
+    warnings : on missing or suspicious data, one line each.
+    notes : assumptions.
     """
 
     attitude: tuple[Rows | None, ...] = ()
@@ -85,7 +85,7 @@ def read_imu(path: Path) -> ImuRecord:
     """Table of time, rates about x y z and specific forces along them.
 
     Columns are recognised by their names (``w_RS_S_x [rad s^-1]``, ``gyro_x``, ``acc_x`` ...); without names they must
-    be in this order. Values are converted by the units that the columns' names state.
+    be in this order. Values are converted by the units in the columns' names.
 
     Raises
     ------
@@ -102,9 +102,9 @@ def read_imu(path: Path) -> ImuRecord:
     table, warnings = table.measured([time, *gyro, *accelerometer])
     times = times_of(table, time)
     rates, forces = table.measures(gyro, RATES), table.measures(accelerometer, FORCES)
-    # rad/s; the fastest gyroscopes reach 70 (4000 degrees a second). A larger number is damage.
+    # 200 rad/s: the fastest gyroscopes reach 70 (4000 degrees a second); larger numbers are damage.
     _possible(rates, 200.0, "rad/s", table)
-    # m/s^2; accelerometers for shocks reach 500 times gravity
+    # 5000 m/s^2: accelerometers for shocks reach 500 times gravity.
     _possible(forces, 5000.0, "m/s^2", table)
     _plausible(rates, forces, table.name)
     return ImuRecord(np.array(times), rates, forces, table.name, warnings)
@@ -114,7 +114,7 @@ def _columns(table: TextTable) -> tuple[list[int], list[int]]:
     """Columns of the rates and of the forces, x y z each."""
     found = [_named(table, GYROSCOPE), _named(table, ACCELEROMETER)]
     named = [(columns, place) for columns, place in zip(found, ORDER, strict=True) if columns]
-    # Names of one sensor alone: the other is in the usual order only if this one is.
+    # With names of one sensor alone, the other has the usual columns only if this one has.
     if len(named) == 1 and named[0][0] != named[0][1]:
         text = f"{table.name}: of its columns {', '.join(table.header)} only those of one sensor are recognised"
         remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
@@ -129,7 +129,7 @@ def names_sensors(table: TextTable) -> bool:
 
 
 def _named(table: TextTable, starts: re.Pattern[str]) -> list[int]:
-    """The three columns whose names begin so, x y z; none where there are not just three."""
+    """The three columns x y z whose names begin so; empty unless there are exactly three."""
     found = [k for k, name in enumerate(table.header) if starts.match(name)]
     return found if len(found) == 3 else []
 
@@ -153,7 +153,7 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
         text = f"{name}: the rates are {turn:.3g} and the accelerations {force:.3g}: they look exchanged"
         remedy = "order the columns time, rates, accelerations, or name them gyro_x ... acc_x ..."
         raise InputError("RIL-187", text, remedy=remedy)
-    # Multiples of gravity, or without it; even the Moon's is more, and no vehicle is pressed by five times the Earth's.
+    # Else in multiples of gravity, or without it: the Moon's is more, and no vehicle has five times the Earth's.
     if not 1.2 <= force <= 50.0:
         text = (
             f"{name}: accelerations of {force:.3g} are too {'small' if force < 1.2 else 'large'} to be gravity in m/s^2"
@@ -167,7 +167,7 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Samples without a gap, their bias removed; ``turned`` (n, 3, 3) is R_reference_imu, identity at the first one."""
+    """Samples without a gap, without bias; ``turned`` (n, 3, 3) is R_reference_imu, identity at the first sample."""
 
     times: Floats
     rates: Floats
@@ -176,7 +176,7 @@ class Stretch:
     slack: float
 
     def holds(self, moment: float) -> bool:
-        """Whether a moment lies within, or beyond an end by no more than the usual spacing."""
+        """Whether a moment lies within, or beyond an end by at most the usual spacing."""
         return bool(self.times[0] - self.slack <= moment <= self.times[-1] + self.slack)
 
     def attitude(self, moment: float) -> Floats:
@@ -206,8 +206,8 @@ def unaccelerated(force: Floats, spread: Floats, rate: Floats) -> Bools:
     """
     # 9.81 m/s^2: 9.78 to 9.83 on the ground; accelerometers of drones are biased by up to 0.1.
     level = np.abs(np.linalg.norm(force, axis=-1) - 9.81) <= 0.2
-    # An accelerated body's force wanders. While a sensor turns, its force is not trusted, for it stands off the axis;
-    # at rest cheap sensors have a rate of 0.08.
+    # The force of an accelerated body varies; that of a turning sensor has a centrifugal part; at rest cheap sensors
+    # have a rate of 0.08.
     return np.asarray(level & (spread.max(axis=-1) <= 0.2) & (np.linalg.norm(rate, axis=-1) <= 0.15))
 
 
@@ -230,7 +230,7 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
     bias, notes = resting_bias(imu, at[0], at[-1])
     parts = stretches(imu, bias, at[0] - HALF_WINDOW, at[-1] + HALF_WINDOW)
     part = [next((p for p, s in enumerate(parts) if s.holds(moment)), None) for moment in at]
-    # rotations across a gap are not known: one reference holds only for the part with most frames
+    # Rotations across a gap are unknown: the reference is that of the part with most frames.
     longest = max(range(len(parts)), key=lambda p: (part.count(p), -p), default=None)
     R_imu_left = T_imu_left.rotation
     attitude: list[Rows | None] = []
@@ -245,10 +245,10 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
 
 
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:
-    """The parts of a record from ``start`` to ``end`` (s) without gaps, each of two samples at least."""
+    """The parts of a record from ``start`` to ``end`` (s) without gaps, each of at least two samples."""
     # 2.5 median spacings: one missing sample (2) is common, more is not.
     slack = 2.5 * float(np.median(np.diff(imu.times)))
-    # 0.1 s: longest gap in the samples over which the rate is interpolated; a slow sensor's usual spacing is none.
+    # 0.1 s: longest gap in the samples over which the rate is interpolated, unless the usual spacing is longer.
     bridge = max(0.1, slack)
     near = np.flatnonzero((imu.times >= start - bridge) & (imu.times <= end + bridge))
     out = []
@@ -272,15 +272,15 @@ def integrate(times: Floats, rates: Floats) -> Floats:
 
 
 def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | None, tuple[str, ...]]:
-    """What the gyroscope reads in rest (3,), rad/s, and a note on how it was found; None without rest.
+    """Gyroscope bias (3,), rad/s, by its readings at rest, and a note on these; None without rest.
 
     Rest is a second in which means over 0.1 s of rate and force are steady, the force is as large as gravity and the
-    rate no larger than a bias can be. A steady slow turn about the vertical looks the same; where resting seconds
-    disagree, those count that agree with the quietest one. A bias wanders (0.1 degrees a second in two minutes), so
-    that of all rest the five seconds nearest to the frames count, which last from ``start`` to ``end``.
+    rate no larger than a bias can be. A steady slow turn about the vertical looks the same; if resting seconds
+    disagree, those that agree with the quietest one count. A bias drifts (0.1 degrees a second in two minutes), so the
+    five seconds at rest nearest to the frames (from ``start`` to ``end``) count.
     """
     rate, force = bins(imu.rates, imu.times), bins(imu.forces, imu.times)
-    # s; shortest stretch that counts as rest
+    # 1 s: shortest rest.
     count = round(1.0 / BIN)
     if len(rate) < count:
         return None, (NO_BIAS,)
@@ -295,9 +295,9 @@ def resting_bias(imu: ImuRecord, start: float, end: float) -> tuple[Floats | Non
     covered = np.convolve(rest, np.ones(count)) > 0  # bins of a second of rest
     times = bins(imu.times[:, None], imu.times)[covered, 0]
     away = np.maximum(start - times, 0) + np.maximum(times - end, 0)
-    # s; more does not make a better bias, only an older one
+    # 5 s: more makes the bias older, not better.
     nearest = np.argsort(away, kind="stable")[: round(5.0 / BIN)]
-    bias = np.median(rate[covered][nearest], axis=0)  # seconds at the ends of a rest may have some movement
+    bias = np.median(rate[covered][nearest], axis=0)  # the ends of a rest may have some motion
     words = ", ".join(f"{v:.4f}" for v in bias)
     return bias, (f"gyroscope bias ({words}) rad/s from {len(nearest) * BIN:.1f} s of rest",)
 
@@ -306,7 +306,7 @@ NO_BIAS = "the gyroscope's bias is not known (no second of rest in its record): 
 
 
 def bins(values: Floats, times: Floats) -> Floats:
-    """Means (m, 3) of successive samples over 0.1 s; a remainder is left out, unless it is all there is."""
+    """Means (m, 3) of successive samples over 0.1 s; without the remainder, unless there is nothing else."""
     size = max(1, round(BIN / float(np.median(np.diff(times)))))
     count = max(1, len(values) // size)
     return np.asarray(values[: count * size].reshape(count, -1, values.shape[1]).mean(axis=1), dtype=np.float64)

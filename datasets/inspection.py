@@ -31,7 +31,7 @@ from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 DEPTH = 4
-"""Folders below the given one that are looked into; more is another data set."""
+"""Levels of folders that are searched; deeper ones are other data sets."""
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json")
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
@@ -51,11 +51,11 @@ class FoundImages:
     pairs : number of pairs.
     sizes : of the left and of the right images, if all of a side have the same.
     why : how left and right were recognised.
-    trouble : why the images cannot be paired; empty if they can.
+    trouble : why the images cannot be paired; empty: they can.
     stamped : whether the file names are times since an epoch.
     sides : the words or letters in the names that mark left and right.
-    absent : of the pairs that lack a file, what is missing; they are counted in ``pairs``.
-    lines : how the pairs are joined by the time stamps in their names, where these differ.
+    absent : missing files of pairs, which are counted in ``pairs``.
+    lines : on the pairing by time stamps in the names, if these differ.
     others : patterns of the left images of other sets of pairs.
     """
 
@@ -74,10 +74,10 @@ class FoundImages:
 
 @dataclass(frozen=True)
 class FoundCalibration:
-    """Calibration files that suit: one for both cameras or one each, relative to the folder.
+    """Suitable calibration files: one for both cameras or one each, relative to the folder.
 
-    ``names``: which two of its cameras, where the file has more. ``mount``: T_reference_left, where the reference frame
-    of the files is another one than the left camera's, most often that of the body or of the IMU.
+    ``names``: of the two cameras, if the file has more. ``mount``: T_reference_left, if the reference frame of the
+    files is not the left camera's, but mostly that of the body or of the IMU.
     """
 
     files: tuple[str, ...]
@@ -88,13 +88,13 @@ class FoundCalibration:
     mount: RigidTransform | None = None
 
     def suits(self, sizes: Sizes | None) -> bool:
-        """Whether it is of images of these sizes, as far as both are known."""
+        """Whether it fits images of these sizes, as far as both are known."""
         return sizes is None or all(own in (None, size) for own, size in zip(self.sizes, sizes, strict=True))
 
 
 @dataclass
 class Findings:
-    """Everything that was found in a folder; paths are relative to it."""
+    """Findings in a folder; paths are relative to it."""
 
     folder: Path
     views: FoundImages
@@ -113,7 +113,7 @@ def inspect(folder: Path) -> Findings:
     ------
     InputError
         ``folder`` is not a folder, its images cannot be divided into those of a left and a right camera, or the name of
-        a file that is looked at cannot stand in a manifest.
+        a file cannot be written in a manifest.
     """
     if not folder.is_dir():
         remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
@@ -132,7 +132,7 @@ def inspect(folder: Path) -> Findings:
     found.unread += search.closed
     found.unread += [f"{of} and its right images: of another set" for of in found.views.others]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
-    # Each is tried as a calibration and as a table; thousands of them (one an image) would take minutes.
+    # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
         texts = texts[:MOST_TEXTS]
@@ -157,16 +157,16 @@ def inspect(folder: Path) -> Findings:
 
 
 def _files(folder: Path, search: Search) -> list[Path]:
-    """Files below a folder in natural order, without hidden ones and what Rille wrote, its manifests and runs."""
+    """Files below a folder in natural order, without hidden ones, and without Rille's manifests and runs."""
     found = list(search.below(folder, DEPTH, links=True))
-    # A run, which has a ledger, holds no data: its trajectory would be the truth that it is judged by.
+    # A run (with a ledger) holds no data: its trajectory would become the truth.
     runs = {place for place, entries in found if any(e.name == "ledger.jsonl" for e in entries)}
     paths = (Path(e.path) for place, entries in found if runs.isdisjoint((place, *place.parents)) for e in entries)
     return sorted(filter(_is_data, paths), key=lambda path: natural(str(path)))
 
 
 def _is_data(path: Path) -> bool:
-    """Whether a path is a file that is no manifest, whatever its name."""
+    """Whether a path is a file, and no manifest of any name."""
     with suppress(InputError):
         if path.suffix == ".toml" and "images" in read_toml(path, "manifest"):
             return False
@@ -186,7 +186,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     Raises
     ------
     InputError
-        No names tell the images of two cameras apart.
+        Names do not distinguish the images of two cameras.
     """
     named: dict[tuple[int, str], list[tuple[str, int, Path]]] = defaultdict(list)
     groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
@@ -217,7 +217,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
-    # Most pairs first; of as many, the surest token (SIDES), and the shortest name: not left_depth before left.
+    # Most pairs first; of equally many the surest token (SIDES), and the shortest name: left before left_depth.
     key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
     sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
@@ -244,14 +244,14 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
 
 
 def _place(path: Path, without: str) -> str:
-    """Where a file of a set lies: its folder with the side's token taken out, and its kind."""
+    """Place of a set's file: its folder without the side's token, and its kind."""
     return f"{without.rpartition('/')[0]} {path.suffix.lower()}"
 
 
 def pattern(paths: list[Path], folder: Path) -> str:
-    """The narrowest simple pattern of a set of files in one folder (or in one folder a side)."""
+    """The narrowest simple pattern of a set of files in one folder (or in one folder for each side)."""
     names = [path.name for path in paths]
-    if len({path.suffix for path in paths}) > 1:  # a search finds suffixes in any case
+    if len({path.suffix for path in paths}) > 1:  # searches ignore the case of suffixes
         names = [path.stem + path.suffix.lower() for path in paths]
     below = {_relative(path.parent, folder) for path in paths}
     place = "" if below == {"."} else (glob.escape(min(below)) if len(below) == 1 else "**") + "/"
@@ -263,7 +263,7 @@ def pattern(paths: list[Path], folder: Path) -> str:
 
 
 def _common_start(words: list[str]) -> str:
-    """Letters that all words begin with."""
+    """Common beginning of all words."""
     return "".join(of[0] for of in takewhile(lambda letters: len(set(letters)) == 1, zip(*words, strict=False)))
 
 
@@ -271,14 +271,14 @@ def _common_start(words: list[str]) -> str:
 
 
 def find_calibration(found: Findings, texts: list[Path]) -> None:
-    """Of all files that are calibrations, the one or the two that serve this rig best."""
+    """Find the one or the two calibration files that suit this rig best."""
     read: dict[str, list[CalibratedCamera]] = {}
     for path in texts:
         relative = _relative(path, found.folder)
         try:
             cameras = read_cameras(path)
         except (RilleError, OSError, ValueError) as error:
-            # Most files of text are tables, or something else altogether; what is refused for its lens is neither.
+            # Most text files are tables, or something else; a file refused for its lens is a calibration.
             other = path.suffix.lower() in TABLES or (isinstance(error, RilleError) and error.remedy == KNOWN)
             refused = re.match(r"RIL-(81\d|120|135)", getattr(error, "code", ""))
             if refused or "calib" in path.stem.lower() or not other:
@@ -303,7 +303,7 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
 
 
 def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
-    """The two of several cameras whose numbers the images' names have (``image_2`` is that of ``P2``), or the first."""
+    """The two of several cameras with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
     numbers = [re.search(r"\d+$", side) for side in sides]
     by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
     chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
@@ -323,14 +323,14 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Fou
 
 
 def table_kind(path: Path, pairs: int) -> str:
-    """What a table of numbers holds, by its header and first row: truth, imu, attitude, times, or nothing.
+    """Kind of a table of numbers, by its header and first row: truth, imu, attitude, times ...; empty: no table.
 
     Raises
     ------
     InputError
-        It is no text, has decimal commas, or is one of true positions by its columns' names, and cannot be read.
+        It is no text, has decimal commas, or is one of true positions by its columns' names, but cannot be read.
     """
-    # Refuses what is no text; of other files most are no tables, which is no error.
+    # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
         raise InputError(
             "RIL-976",
@@ -352,7 +352,7 @@ def table_kind(path: Path, pairs: int) -> str:
     if matrix_at(table) is not None:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None
-    # Without times they must be one a pair.
+    # Without times there must be one for each pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"
     return _kind_of_row(row, len(table.rows), pairs, named)

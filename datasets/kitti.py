@@ -1,11 +1,11 @@
-"""Folders of rectified or calibrated pairs in the manner of KITTI odometry (Geiger et al. 2012).
+"""Folders of rectified or calibrated pairs in the layout of KITTI odometry (Geiger et al. 2012).
 
 Two layouts are recognised: the standard one, ``ROOT/sequences/NN`` with ``ROOT/poses/NN.txt`` (given as the sequence's
 folder, or as ``ROOT:NN``), and a self-contained folder with two image folders, ``calib.txt``, and optionally
-``poses.txt`` and ``times.txt``. Both become a manifest (:mod:`rille.datasets.manifest`), by which the folder is read.
+``poses.txt`` and ``times.txt``. Both become a manifest (:mod:`rille.datasets.manifest`), which opens the folder.
 
-``calib.txt`` is read by :mod:`rille.datasets.cameras.kitti`, or whatever else it holds. ``poses.txt`` has
-T_world_reference, 3 x 4 a line, of the frame that the calibration refers to.
+``calib.txt`` may have any format of :mod:`rille.datasets.cameras`. Each line of ``poses.txt`` is T_world_reference,
+3 x 4, of the calibration's reference frame.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ FORMS = (
 
 
 def image_folders(folder: Path) -> tuple[str, str] | None:
-    """The pair of image folders that a folder has."""
+    """The pair of image folders in a folder; None: there is none."""
     return next((p for p in PAIRS if all((folder / side).is_dir() for side in p)), None)
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:
-    """The sequence of a folder, or None where it has not this layout.
+    """The sequence of a folder; None if it has another layout.
 
     Raises
     ------
     InputError
-        There are several and none is chosen, or what is there cannot be used.
+        There are several and none is chosen, or files cannot be used.
     """
     folder = _of_several(path, number) if (path / "sequences").is_dir() else None if number is not None else path
     sides = None if folder is None else image_folders(folder)
@@ -71,7 +71,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
 
 
 def _of_several(root: Path, number: str | None) -> Path:
-    """Folder of the sequence that is chosen by its number, or of the only one."""
+    """Folder of the sequence with this number, or of the only one."""
     there = sorted(d.name for d in (root / "sequences").iterdir() if d.is_dir() and image_folders(d))
     if number is None and len(there) != 1:
         example = there[0] if there else "00"
@@ -83,7 +83,7 @@ def _of_several(root: Path, number: str | None) -> Path:
 
 
 def manifest_of(folder: Path, sides: tuple[str, str]) -> Manifest:
-    """What the folder holds, as a manifest would say it."""
+    """Manifest of the folder."""
     standard = folder.parent.name == "sequences"
     cameras = {camera.name: camera for camera in read_cameras(folder / "calib.txt")}
     names = camera_names(folder / "calib.txt", sides, set(cameras))
@@ -105,10 +105,10 @@ def manifest_of(folder: Path, sides: tuple[str, str]) -> Manifest:
 
 
 def camera_names(calibration: Path, sides: tuple[str, str], there: set[str]) -> tuple[str, str] | None:
-    """Labels of the cameras that took the images, by the folders' numbers; None: those of the file, if they are two."""
+    """Labels of the images' cameras, by the folders' numbers; None: the cameras of the file, if they are two."""
     numbers = [side[-1] for side in sides]
     forms = [(form.format(numbers[0]), form.format(numbers[1])) for form in ("P{}", "P_rect_0{}")]
     chosen = next((names for names in [*forms, ("P1_roi", "P2_roi")] if set(names) <= there), None)
-    # Rows without labels are those of the two folders; labels of other cameras are not.
+    # Rows without labels belong to the two folders; labels of other cameras do not.
     labelled = numbers[0].isdecimal() and ":" in read_text(calibration, "calibration")
     return forms[0] if chosen is None and labelled else chosen

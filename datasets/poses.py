@@ -1,21 +1,20 @@
-"""Trajectories and attitudes of other programs and sensors, and their poses at other times.
+"""Trajectories and attitudes of other programs and sensors, and interpolation of their poses.
 
-Forms of a file, one pose T_reference_body a row:
+Forms of a file, one pose T_reference_body per row:
 
-* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, perhaps behind a time;
+* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, perhaps after a time;
 * ``tum``: time, x y z, quaternion x y z w;
-* ``euroc``: time, x y z, quaternion w x y z, and whatever follows;
+* ``euroc``: time, x y z, quaternion w x y z, perhaps other columns;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``);
   of a robot on a plane ``x y`` and ``yaw`` or ``theta``;
-* ``colmap``: ``images.txt`` of a text model, two lines an image: number, quaternion w x y z and translation from the
-  world to the camera, the camera's number and the image's name; then its points, which are passed over.
+* ``colmap``: ``images.txt`` of a text model, two lines for each image: number, quaternion w x y z and translation from
+  the world to the camera, the camera's number and the image's name; then its points, which are skipped.
 
 Truth may be positions alone (:func:`positions_of`): columns x, y and perhaps time and z, by name or as the manifest
 states.
 
-Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Coordinates and angles without a column
-are 0.
+Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Missing coordinates and angles are 0.
 """
 
 from __future__ import annotations
@@ -49,16 +48,16 @@ ORDERED: Mapping[str, tuple[str, ...]] = {
 
 IMAGES = ("image", *QUATERNION, *POSITION, "camera", "name")
 IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
-"""Line of an image in a model of COLMAP, where the name is that of an image."""
+"""Line of an image in a model of COLMAP."""
 
 STAMP = re.compile(r"\d{16,}")
-"""Time of EuRoC, nanoseconds; programs that write seconds have other orders."""
+"""Time of EuRoC, nanoseconds; programs that write seconds have other orders of columns."""
 
 MIN_ROUNDED = 4
-"""Rows from which on coordinates tell their precision."""
+"""Fewest rows whose coordinates show their precision."""
 
 WITHIN = 1e-6
-"""s; times that agree to this are the same."""
+"""s; times that differ by less are equal."""
 
 WORDS = (
     (
@@ -67,30 +66,30 @@ WORDS = (
         ),
         lambda m: "time",
     ),
-    # Tools of ROS write the path of a field before its name.
+    # ROS tools write the path of a field before its name.
     (re.compile(r"(.*[./])?(q|r|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
     (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"theta"), lambda m: "yaw"),
-    # A baseline is that of RTKLIB, from the reference station.
+    # RTKLIB has baselines from the reference station.
     (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
     (re.compile(r"up|u-baseline|height|alt|altitude|elevation|down|depth"), lambda m: "z"),
 )
 
 DOWNWARDS = re.compile(r"down|depth")
-"""Names of columns of z that count downwards, as those of NED frames and of vehicles under water."""
+"""Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
 
-# Names of columns that are 0 where a receiver of GNSS has no position; a status is 0 where it has one.
+# Names of columns that are 0 if a GNSS receiver has no position, unlike a status, which is 0 if it has one.
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
-"""In names of columns of degrees, and of coordinates from the Earth's centre."""
+"""Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
-"""Name of a column behind that of the whole seconds, as ROS stamps messages."""
+"""Name of a column after that of the whole seconds, as in stamps of ROS messages."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +98,11 @@ class TimedPoses:
 
     Attributes
     ----------
-    times : seconds, increasing; None where the file has none, and rows are frames.
-    poses : T_reference_body, metres, one a row; None of a row of NaN, or of zeros.
+    times : seconds, increasing; None if the file has none, and rows are frames.
+    poses : T_reference_body, metres, one per row; None for a row of NaN, or of zeros.
     name : the file, for messages.
     warnings : on rows that were left out.
-    images : names of the images, with or without folders, whose rows they are; empty where the file names none.
+    images : names of the rows' images, with or without folders; empty if the file names none.
     """
 
     times: tuple[float, ...] | None
@@ -114,7 +113,7 @@ class TimedPoses:
 
 
 def read_motion(path: Path, format: str = "auto") -> TextTable:
-    """The table of a file of poses or positions, whatever its form (see module)."""
+    """The table of a file of poses or positions in any form (see module)."""
     images = of_images(path) if format in ("auto", "colmap") else None
     return read_table(path, "pose file") if images is None else images
 
@@ -124,9 +123,9 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
 
     Parameters
     ----------
-    format : one of the forms; ``auto`` takes the columns' names where there are any, else 12 or 16 numbers a row for
-        ``kitti``, commas for ``euroc`` and blanks for ``tum``.
-    unit : m; length of one unit of the file; None: as the names of its columns say, else 1.
+    format : one of the forms; ``auto`` goes by the columns' names if there are any, else 12 or 16 numbers per row mean
+        ``kitti``, commas ``euroc`` and blanks ``tum``.
+    unit : m; length of one unit of the file; None: by the names of its columns, else 1.
 
     Raises
     ------
@@ -159,16 +158,16 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
 
 
 def _at_origin(values: Floats) -> Bools:
-    """Rows (n,) of x, y, z, qx, qy, qz (n, 6) that are the pose at the origin, which lies far from the row before.
+    """Rows (n,) of x, y, z, qx, qy, qz (n, 6) at the origin, far from the row before.
 
-    Some programs write it where they have none.
+    Some programs write this pose if they have none.
     """
     origin = ~values.any(axis=1)
     measured = np.asarray(~origin & (np.abs(values) < GREATEST).all(axis=1))
     places = np.where(measured[:, None], values[:, :3], 0.0)
     steps = np.linalg.norm(np.diff(places[measured], axis=0), axis=1)
     before = np.maximum.accumulate(np.where(measured, np.arange(len(values)), 0))
-    # Who comes back to the origin does so by steps like the others.
+    # A true return to the origin has steps like the others.
     jump = 10.0 * float(np.mean(steps)) if len(steps) else np.inf
     return np.asarray(origin & (np.linalg.norm(places[before], axis=1) > jump))
 
@@ -183,7 +182,7 @@ def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> 
 
 
 def _lengths(table: TextTable, columns: Sequence[int], unit: float | None) -> Floats:
-    """Coordinates (n, columns), m, of which those that count downwards change their sign."""
+    """Coordinates (n, columns), m; the sign of those that count downwards is changed."""
     signs = [-1.0 if table.header and DOWNWARDS.fullmatch(unitless(table.header[k])) else 1.0 for k in columns]
     return table.measures(columns, units.LENGTHS, unit) * signs
 
@@ -209,12 +208,12 @@ class TimedPositions:
 def positions_of(
     table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None
 ) -> TimedPositions | None:
-    """Positions of a table without rotations; None where the file holds poses.
+    """Positions of a table without rotations; None if the file holds poses.
 
     Parameters
     ----------
-    columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, where the table's names do not say it; with any
-        of them the table is one of positions.
+    columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, unless the table's names are clear; with any of
+        them the table is one of positions.
     unit : as for :func:`poses_of`.
 
     Raises
@@ -250,7 +249,7 @@ def positions_of(
 
 
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
-    """Warn of coordinates (n, 2 or 3), m, that are numbers of single precision, rounded to centimetres or worse."""
+    """Warning about coordinates (n, 2 or 3), m, in single precision, rounded to centimetres or more."""
     single = places.astype(np.float32)
     rounded = (places == single).all(axis=0) & (np.ptp(places, axis=0) > 0)
     step = float(np.spacing(np.abs(single).max(axis=0))[rounded].max(initial=0.0))
@@ -265,16 +264,16 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
-    """Whether a receiver had no position in a row: its quality is 0, or x and y are, a kilometre from all others."""
+    """Rows without a position of the receiver: its quality is 0, or x and y are, a kilometre from all others."""
     away = np.hypot(*table.values([x, y]).T)
     quality = table.values([k for k, name in enumerate(table.header) if FIX.fullmatch(name)])
     none = ((quality == 0) & (quality > 0).any(axis=0)).any(axis=1)
-    # m; no vehicle jumps so far
+    # 1000 m: no vehicle jumps so far.
     return np.asarray(none | ((away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)))
 
 
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:
-    """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit that its name states."""
+    """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit of its name."""
     stamps, stated = table.text(column), table.unit(column)
     unit = stated if stated in UNITS else "auto"
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
@@ -288,7 +287,7 @@ def names_positions(table: TextTable) -> bool:
 
 
 def _column(table: TextTable, stated: str | int) -> int:
-    """Number from 0 of a column that the manifest names or numbers."""
+    """Index of a column that the manifest names or numbers."""
     for names in (table.header, list(map(unitless, table.header))):
         if isinstance(stated, str) and stated.strip().lower() in names:
             return names.index(stated.strip().lower())
@@ -299,7 +298,7 @@ def _column(table: TextTable, stated: str | int) -> int:
 
 
 def meanings(table: TextTable) -> dict[str, int]:
-    """Columns by what their names mean."""
+    """Columns by the meaning of their names."""
     columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
         bare = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
@@ -347,7 +346,7 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
 
 
 def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
-    """Rotation matrices (n, 3, 3) of roll, pitch and yaw, in the unit that the names say, or the figures alone."""
+    """Rotation matrices (n, 3, 3) of roll, pitch and yaw, in the unit of the names, else of the magnitudes."""
     from scipy.spatial.transform import Rotation
 
     known = [k for k, a in enumerate(ANGLES) if a in columns]
@@ -362,7 +361,7 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
         text = f"{table.name}: the angles {names} have {'two units' if stated - {''} else 'no unit'}"
         remedy = "write it behind their names, as yaw_deg or yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
-    # Capitals turn about the axes as they are turned already: yaw first, then pitch, then roll.
+    # Capitals: intrinsic rotations, yaw first, then pitch, then roll.
     turns = Rotation.from_euler("ZYX", values[:, ::-1])
     return np.asarray(turns.as_matrix(), dtype=np.float64)
 
@@ -373,7 +372,7 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
 
     q = table.numbers([columns[name] for name in ("qx", "qy", "qz", "qw")])
     norms = np.linalg.norm(q, axis=1)
-    # Of a quaternion, off 1: text keeps three digits at least; more is another column
+    # 0.01: difference of the norm from 1; text has at least three digits, so more means another column.
     bad = np.flatnonzero(np.abs(norms - 1) > 0.01)
     if bad.size:
         k = int(bad[0])
@@ -384,7 +383,7 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
 
 
 def matrix_at(table: TextTable) -> int | None:
-    """Column from which on rows are [R | t], 0 or, behind a time, 1; None where the first whole one is no rotation."""
+    """First column of [R | t]: 0, or 1 after a time; None if the first whole row holds no rotation."""
     first = int(table.columns in (13, 17))
     if table.columns - first not in (12, 16):
         return None
@@ -394,7 +393,7 @@ def matrix_at(table: TextTable) -> int | None:
 
 
 def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:
-    """Poses of rows of [R | t], of which t is in units of ``unit`` m, behind a time or without."""
+    """Poses of rows of [R | t], perhaps after a time; t is in units of ``unit`` m."""
     if table.columns - timed not in (12, 16):
         text = f"{table.name}, line {table.lines[0]}: {table.columns} numbers are no 3 x 4 pose"
         raise InputError("RIL-267", text, remedy="give 12 numbers a line, perhaps behind a time, or state the format")
@@ -411,7 +410,7 @@ def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:
 
 
 def rounded_pose(m: Floats, where: str) -> RigidTransform:
-    """Pose of [R | t] (3, 4), written with few digits, so that its rotation is made orthonormal.
+    """Pose of [R | t] (3, 4); its rotation, written with few digits, is made orthonormal.
 
     Raises
     ------
@@ -434,7 +433,7 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     Returns
     -------
     tuple
-        One entry a time; None in longer gaps and beyond the first and last row (:func:`coverage` says how many).
+        One entry per time; None in longer gaps and beyond the first and last row (:func:`coverage` counts them).
 
     Raises
     ------
@@ -453,7 +452,7 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
     distance = np.minimum(np.abs(wanted - t[before]), np.abs(wanted - t[after]))
     # At a row itself a gap beside it does not matter.
     known = inside & ((t[after] - t[before] <= max_gap) | (distance <= WITHIN))
-    # By WITHIN at most: Slerp refuses any time beyond its ends.
+    # Changes by WITHIN at most; Slerp refuses any time beyond its ends.
     moment = np.clip(wanted, t[0], t[-1])
     rows = [pose for pose in timed.poses if pose is not None]  # rows of NaN have no times
     positions = np.array([p.translation for p in rows])
@@ -464,7 +463,7 @@ def interpolate(timed: TimedPoses, at: Sequence[float], max_gap: float) -> tuple
 
 
 def refuse_apart(times: Sequence[float] | Floats, at: Sequence[float] | Floats, name: str) -> None:
-    """Refuse a record called ``name`` whose increasing times, s, have nothing in common with those of the frames."""
+    """Refuse a record called ``name`` whose increasing times, s, have none in common with those of the frames."""
     if at[-1] < times[0] - WITHIN or at[0] > times[-1] + WITHIN:
         text = f"{name} reaches from {times[0]:.3f} to {times[-1]:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s"
         remedy = "check that both have the same clock and unit; a manifest states a constant offset as time_offset"
@@ -472,12 +471,12 @@ def refuse_apart(times: Sequence[float] | Floats, at: Sequence[float] | Floats, 
 
 
 def coverage(found: Sequence[object | None], at: Sequence[float], what: str) -> tuple[str, ...]:
-    """A warning line on the frames without an entry: how many, and when; nothing where all have one.
+    """A warning on the number and times of frames without an entry; empty if all have one.
 
     Parameters
     ----------
-    at : seconds, one a frame.
-    what : what is missing, e.g. ``truth``.
+    at : seconds, one per frame.
+    what : name of the missing record, e.g. ``truth``.
     """
     without = [k for k, entry in enumerate(found) if entry is None]
     if not without:

@@ -1,7 +1,7 @@
-"""What a stereo sequence is, whoever recorded or rendered it.
+"""Definition of a stereo sequence, recorded or rendered.
 
-A sequence holds no pixels: it says by which stage each image comes (:class:`Source`), so that reading and rendering
-are cached tasks like all others. Truth is optional and only for assessment; no estimate may read it.
+A sequence holds no pixels, but the stage that makes each image (:class:`Source`), so that reading and rendering are
+cached tasks like all others. Truth is optional and only for assessment; no estimate may read it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def rows_of(rotation: Floats) -> Rows:
 
 @dataclass(frozen=True)
 class Source:
-    """How a task gets its data: a stage module resolved by name, with what identifies this task.
+    """The task that provides data: a stage module, resolved by name, with its parameters and arguments.
 
     ``args`` enter the cache key. ``hints`` (paths) do not: they are merged into the arguments when the stage runs
     (``args | hints``) and must not change its result. ``inputs`` are sources of the stage's input ports, resolved
@@ -84,18 +84,18 @@ class Positions:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A vehicle that can be driven: how its true poses, its sensors' readings and its images come about.
+    """A vehicle that can be driven: sources of its true poses, its sensors' readings and its images.
 
-    Of each :class:`Source` here the input ports are connected by who drives: ``scene`` to the artifact of the world as
-    it is then, the others as named.
+    The closed loop connects the input ports of each :class:`Source`: ``scene`` to the artifact of the world at that
+    time, the others as named.
 
     Attributes
     ----------
     scene : the world at the start.
     place : ``place(vehicle)``, true poses before the first leg (one row): ``scene``.
     drive : ``drive(vehicle, leg, row)``, true poses of a leg: ``scene``; ``before``, the leg that led here, at that
-        row; ``pose``, where the vehicle believes to be; ``leg``, what it is to drive.
-    sense : ``sense(leg)``, what its sensors say: ``drive``.
+        row; ``pose``, the estimated pose; ``leg``, the leg to drive.
+    sense : ``sense(leg)``, readings of its sensors: ``drive``.
     change : ``change(leg, row)``, the world after something happened, with ports as of ``drive``; None: nothing does.
     image : ``image(frame, camera, T_truth_left)``: ``scene``.
     truth_dem : ``truth_dem(lattice, T_truth_world, T_truth_left of stops)``: ``scene``.
@@ -118,7 +118,7 @@ class Simulation:
     overview: Source | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON form of what the rover knows of itself (the sources have keys of their own)."""
+        """JSON form of the rover's own data (the sources have their own keys)."""
         return {"T_vehicle_left": self.T_vehicle_left.to_list(), "pad": self.pad}
 
 

@@ -40,7 +40,7 @@ MANIFESTS: dict[str, str] = {
     "devon_island": "10 pairs of a rover in a Mars-like desert, colour; its files lie in ${RILLE_DATA}/devon_island",
     "nasa_k10": "one pair of NASA's K10 rover, raw and not rectified; its files lie in ${RILLE_DATA}/nasa_k10",
 }
-"""Manifests that come with the program, in the folder beside this module."""
+"""Descriptions of the manifests in the folder beside this module."""
 
 MANIFEST_FORMS = (
     ("FILE.toml", "a manifest of any folder of stereo images; `rille init FOLDER` writes one"),
@@ -55,7 +55,7 @@ def layouts() -> tuple[ModuleType, ...]:
     Each has ``FORMS``, what a user may give and in words what that is, and ``open_layout(path, number, digests)``,
     which gives None where the folder is none of its own; ``number`` chooses one of several (``FOLDER:NUMBER``).
     """
-    # By listing, not by a table: a new layout is one new file, and the order by name is the same everywhere.
+    # By listing, so that a new layout is one new file; sorted by name, for the same order everywhere.
     names = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if not found.ispkg]
     modules = [import_module(f"rille.datasets.{name}") for name in sorted(names)]
     return (*(module for module in modules if hasattr(module, "open_layout")), *_installed())
@@ -63,12 +63,12 @@ def layouts() -> tuple[ModuleType, ...]:
 
 def _installed() -> list[ModuleType]:
     """Modules of the entry points of packages that are installed for this Python, by name."""
-    # Of the folders of installed packages alone: `sys.path` may begin with the current folder.
+    # Only in the folders of installed packages, since `sys.path` may begin with the current folder.
     folders = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     if site.ENABLE_USER_SITE:
         folders.append(site.getusersitepackages())
     distributions = metadata.distributions(path=list(dict.fromkeys(folders)))
-    # Group of the modules by which installed packages add layouts of their own
+    # "rille.formats": entry points by which installed packages add layouts.
     points = (point for one in distributions for point in one.entry_points.select(group="rille.formats"))
     return [point.load() for point in sorted(points, key=lambda point: (point.name, point.value))]
 
@@ -97,7 +97,7 @@ def open_sequence(
     Raises
     ------
     InputError
-        There is no such name or folder, or what is in the folder cannot be used.
+        There is no such name or folder, or the folder's files cannot be used.
     ConfigError
         An override is unknown, not permitted, or of another kind of sequence.
     """
@@ -126,7 +126,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if name_or_path in MANIFESTS:
         return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
     path, number = _split(name_or_path)
-    # os.path, for pathlib raises where a name is too long, or no name.
+    # os.path, because pathlib raises for impossible names.
     if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
         kind = "file" if path.suffix else "sequence"
         gone = is_broken(path) and f"it is a link to {os.readlink(path)}, which is missing"
@@ -136,7 +136,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
-    # What the user wrote down goes before what the folder looks like.
+    # The user's manifest overrides the layout.
     manifest = folder_manifest(path) if number is None and name_or_path and path.is_dir() else None
     if manifest is not None:
         return open_manifest(manifest, digests)
@@ -163,7 +163,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
 
 
 def hindrance(place: Path) -> RilleError | None:
-    """Why a folder or a manifest does not open as it is; None where it does."""
+    """The error by which a folder or a manifest does not open; None if it opens."""
     try:
         _opened(str(place), Digests())
     except RilleError as error:
@@ -194,11 +194,11 @@ def _none_left(sections: Mapping[str, Any], name: str) -> None:
 
 
 def _split(name_or_path: str) -> tuple[Path, str | None]:
-    """Folder, and the sequence's number where it is given as ROOT:NN."""
-    # Not pathlib's, which raises where there is no such user.
+    """Folder, and the sequence's number if given as ROOT:NN."""
+    # Not pathlib's, which raises if there is no such user.
     path = Path(os.path.expanduser(name_or_path))
     root, colon, number = name_or_path.rpartition(":")
-    # A path that exists is taken whole: folders may have a colon in their names.
+    # An existing path may have a colon in its name.
     if not os.path.exists(path) and colon and root:
         return Path(os.path.expanduser(root)), number
     return path, None

@@ -1,4 +1,4 @@
-"""Read calibration files of other programs: intrinsics, lens and pose of each camera. The content tells the format."""
+"""Read calibration files of other programs: intrinsics, lens and pose of each camera; the content tells the format."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
     (lambda text: bool(makers.numbers_of_matrix(text)), makers.matrix),
 )
-"""Text formats: how each is recognised, and its reader."""
+"""Text formats: test and reader of each."""
 
 NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
@@ -63,11 +63,12 @@ NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], 
     (opencv.projections_alone, opencv.projections),
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
 )
-"""Formats of nested entries. ORB-SLAM2 files that also hold unrectified cameras are read as those: the images are."""
+"""Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are
+unrectified."""
 
 
 def read_cameras(path: Path) -> list[CalibratedCamera]:
-    """Cameras of a calibration file, whatever program wrote it: it is recognised by its content.
+    """Cameras of a calibration file, whose format is detected by its content.
 
     Returns
     -------
@@ -76,9 +77,9 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
     Raises
     ------
     InputError
-        The file cannot be read or holds no camera, or an entry is missing or wrong; then the line names the key.
+        The file cannot be read or holds no camera, or an entry (named in the message) is missing or wrong.
     """
-    # An image with its label in front is too large for a calibration and no text: of it, the label alone is read.
+    # Of an image with a label in front only the label is read.
     text = pds.attached(path) or read_text(path, "calibration")
     try:
         return _read(text, path)
@@ -88,7 +89,7 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
 
 
 def _read(text: str, path: Path) -> list[CalibratedCamera]:
-    # Before YAML, for which KITTI's `P0: 7.1 0 ...` is an entry, too: one word where twelve numbers belong.
+    # Before YAML, to which KITTI's `P0: 7.1 0 ...` is an entry of one word.
     plain = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
     for recognises, read in PLAIN:
         if recognises(plain):

@@ -1,6 +1,6 @@
 """Calibrations of BoofCV: one pinhole camera with radial and tangential distortion, or a stereo pair.
 
-Its pixel (0, 0) reaches from (0, 0) to (1, 1) (boofcv.org, Coordinate Systems), so that half a pixel is taken off.
+Its pixel (0, 0) reaches from (0, 0) to (1, 1) (boofcv.org, Coordinate Systems), so half a pixel is subtracted.
 """
 
 from __future__ import annotations

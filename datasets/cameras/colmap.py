@@ -1,6 +1,6 @@
 """Cameras of COLMAP's text models (``cameras.txt``, with ``rigs.txt`` beside it).
 
-Its pixel coordinates begin at the corner of the top left pixel, so that half a pixel is taken off.
+Its pixel coordinates begin at the corner of the top left pixel, so half a pixel is subtracted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MODELS = {
     "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "fisheye"),
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
 }
-"""Its camera models that are read: the order of their parameters, and the lens (:mod:`rille.stages.geometry.lens`)."""
+"""Supported camera models: the order of their parameters, and the lens (:mod:`rille.stages.geometry.lens`)."""
 
 COEFFICIENTS = {"none": "", "radtan": "k1 k2 p1 p2", "rational": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
 """Keys in the order of each lens."""
@@ -40,7 +40,7 @@ def is_colmap(text: str) -> bool:
 
 
 def colmap(text: str, path: Path) -> list[CalibratedCamera]:
-    """Cameras, named by their numbers; poses in the rig's frame where ``rigs.txt`` has exactly one rig."""
+    """Cameras, named by their numbers; with poses in the rig's frame if ``rigs.txt`` has exactly one rig."""
     poses = _rig(path.with_name("rigs.txt"))
     cameras = []
     for number, model, width, height, *values in _lines(text):
@@ -61,7 +61,7 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _rig(path: Path) -> dict[str, RigidTransform]:
-    """T_camera_rig by camera number; nothing where there is no rig, or more than one."""
+    """T_camera_rig by camera number; empty if there is no rig, or more than one."""
     from scipy.spatial.transform import Rotation
 
     lines = _lines(read_text(path, "rigs")) if path.is_file() else []
@@ -82,7 +82,7 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
             raise f.error("RIL-110", "pose", "has a quaternion of length 0")
         rest = rest[7:]
         if kind == "CAMERA":
-            # SciPy takes the scalar last, COLMAP writes it first.
+            # SciPy has the scalar last, COLMAP first.
             poses[number] = RigidTransform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t))
     return poses
 

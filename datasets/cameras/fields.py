@@ -30,9 +30,9 @@ MODELS: Mapping[str, str] = {
     }.items()
     for name in names.split()
 }
-"""Names that programs have for the lens models of :mod:`rille.stages.geometry.lens`, in small letters and digits alone.
+"""Names of the lens models of :mod:`rille.stages.geometry.lens` in other programs, in small letters and digits alone.
 
-Those of "" say nothing of distortion; those of "unread" are other models.
+Names of "" do not tell the distortion; those of "unread" are unsupported models.
 """
 
 LENS = re.compile(
@@ -40,21 +40,21 @@ LENS = re.compile(
     r"|proj(ection)?_?(model|type)|radial|tangential|prism|coef|(^|[._ ])d\d?$",
     re.I,
 )
-"""Keys of what describes a lens: a word names its model, numbers are its coefficients."""
+"""Keys of a lens: their value is the name of its model, or its coefficients."""
 
 COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radial|tangential|coef", re.I)
-"""Keys of one number that is a coefficient: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
+"""Keys of single coefficients: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
 
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
-"""In keys that only look like those of a lens: they hold its errors, or the name of something."""
+"""Part of keys that only look like those of a lens: of its errors, or of names."""
 
 
 class Fields:
-    """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the way to a nested part.
+    """Entries of a calibration file by key; ``file`` is its name for errors, ``at`` the full key of a nested part.
 
     Attributes
     ----------
-    used : full keys that a reader has taken, nested ones included.
+    used : full keys that a reader has read, nested ones included.
     """
 
     def __init__(self, values: Mapping[Any, Any], file: str, at: str = "", used: set[str] | None = None) -> None:
@@ -69,7 +69,7 @@ class Fields:
         return InputError(code, f"{self.file}: {self.at}{key} {what}", remedy=remedy)
 
     def get(self, key: str) -> Any:
-        """An entry that must be there."""
+        """A required entry."""
         if key not in self:
             raise self.error("RIL-113", key, "is missing")
         self.used.add(self.at + key)
@@ -83,19 +83,19 @@ class Fields:
         return Fields(value, self.file, f"{self.at}{key}.", self.used)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A word; ``default`` where the key is missing."""
+        """A word; ``default`` if the key is missing."""
         if key not in self and default is not None:
             return default
         return str(self.get(key)).strip()
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A finite number; ``default`` where the key is missing."""
+        """A finite number; ``default`` if the key is missing."""
         if key not in self and default is not None:
             return default
         return self._number(key, self.get(key))
 
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
-        """A list of finite numbers, row by row where it is a matrix; ``count`` of them."""
+        """A list of ``count`` finite numbers; a matrix row by row."""
         flat = _flat(self.get(key))
         if flat is None:
             raise self.error("RIL-115", key, f"is {_shown(self.values[key])}, it should be a list of numbers")
@@ -108,13 +108,13 @@ class Fields:
         return np.array(self.numbers(key, rows * columns)).reshape(rows, columns)
 
     def size(self, width: str, height: str) -> tuple[int, int]:
-        """Image size from two keys, pixels; ``UNKNOWN_SIZE`` where both are missing."""
+        """Image size from two keys, pixels; ``UNKNOWN_SIZE`` if both are missing."""
         if width not in self and height not in self:
             return UNKNOWN_SIZE
         return self._pixels(width, self.number(width)), self._pixels(height, self.number(height))
 
     def pair_of_pixels(self, key: str) -> tuple[int, int]:
-        """Image size from one key with width and height; ``UNKNOWN_SIZE`` where it is missing."""
+        """Image size from one key with width and height; ``UNKNOWN_SIZE`` if it is missing."""
         if key not in self:
             return UNKNOWN_SIZE
         width, height = self.numbers(key, 2)
@@ -143,7 +143,7 @@ class Fields:
         return self.camera(key, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), size)
 
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
-        """Camera from fx, fy, cx, cy, pixels; ``key`` is where they stand."""
+        """Camera from fx, fy, cx, cy, pixels; ``key``: of these, for errors."""
         try:
             fx, fy, cx, cy = map(float, values)
             return Camera(fx, fy, cx, cy, *size)
@@ -151,21 +151,21 @@ class Fields:
             raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 
     def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
-        """Lens with a model of :mod:`rille.stages.geometry.lens`; ``key`` is where the coefficients stand."""
+        """Lens with a model of :mod:`rille.stages.geometry.lens`; ``key``: of the coefficients, for errors."""
         try:
             return Lens(camera, model, coefficients)
         except InputError as error:
             raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
     def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
-        """Lens of numbers that stand each at a key of its own.
+        """Lens of numbers with a key each.
 
         Parameters
         ----------
         pinhole : keys of fx, fy, cx and cy (``"f f cx cy"``), pixels.
-        model, coefficients : of :mod:`rille.stages.geometry.lens`, and their keys in its order; those that are missing
-            are 0 but for a fisheye's, and where all are, there is no distortion.
-        corner : pixels; where the first pixel's corner lies for the program: 0.5 left of its centre, or at 0.
+        model, coefficients : of :mod:`rille.stages.geometry.lens`, and their keys in its order; missing ones are 0,
+            except for a fisheye, and if all are missing, there is no distortion.
+        corner : pixels; 0.5 if the corner of the first pixel is at 0 in the program, 0 if its centre is.
         """
         keys = pinhole.split()
         fx, fy, cx, cy = (self.number(key) for key in keys)
@@ -177,16 +177,16 @@ class Fields:
         return self.lens(keys[0], camera, model, values[:4] if model == "radtan" and not any(values[4:]) else values)
 
     def model(self, coefficients: str) -> str:
-        """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty where none does.
+        """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty if none does.
 
         Parameters
         ----------
-        coefficients : key of their list, which must not be missing beside a model.
+        coefficients : key of their list, which is required with a model.
 
         Raises
         ------
         InputError
-            The model is not read, two keys name two, or there are no coefficients.
+            The model is unsupported, two keys name two, or there are no coefficients.
         """
         named = {key: model for key, value in self.values.items() if (model := _named(key, value))}
         self.used |= {self.at + key for key in named}
@@ -204,7 +204,7 @@ class Fields:
         return model
 
     def check_lens(self) -> None:
-        """Refuse what names a lens or its coefficients and was not taken: the images would be read by another lens."""
+        """Refuse entries of a lens that were not read, without which the images would get another lens."""
         for key, value in _untaken(self.values, self.at, self.used):
             text = f"= {_shown(value)} seems to describe the lens, and is not read there"
             remedy = "state the lens by the keys of its format (e.g. distortion_model), or remove the entry"
@@ -212,7 +212,7 @@ class Fields:
 
     def _number(self, key: str, value: Any) -> float:
         try:
-            # float(True) is 1.0, but nobody states a length so.
+            # float(True) would be 1.0.
             number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError):
             number = math.nan
@@ -226,7 +226,7 @@ class Fields:
         return int(value)
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
-        """Rigid transform of numbers that stand at ``key``."""
+        """Rigid transform of the numbers at ``key``."""
         try:
             return RigidTransform(rotation, translation)
         except InputError as error:
@@ -234,7 +234,7 @@ class Fields:
 
 
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
-    """Model that OpenCV takes for so many coefficients, and the coefficients without what is zero by default."""
+    """Model that OpenCV uses for a number of coefficients, and the coefficients without trailing zeros."""
     k = coefficients
     # OpenCV writes all coefficients of its largest model, with zeros for the terms that were not estimated.
     if len(k) == 14 and not any(k[12:]):
@@ -247,7 +247,7 @@ def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
 
 
 def _named(key: str, value: Any) -> str:
-    """Lens model that an entry names; "unread" where it is another one, empty where it names none."""
+    """Lens model that an entry names; "unread" if it is unsupported, empty if it names none."""
     if OTHER.search(key) or isinstance(value, Mapping | list) or value is None:
         return ""
     word = re.sub(r"[^a-z0-9]", "", str(value).lower())
@@ -255,14 +255,14 @@ def _named(key: str, value: Any) -> str:
         return "fisheye"
     if word in ("", "false", "no") or word[0].isdigit():
         return ""
-    # Kalibr's command line says pinhole-equi.
+    # Kalibr's command line has pinhole-equi.
     model, certain = MODELS.get(word.removeprefix("pinhole") or word, "unread"), LENS.search(key)
-    # Under any other key a word that stands for this only; short ones may stand for something else.
+    # With any other key only unambiguous words; short ones may mean something else.
     return model if certain or (word in MODELS and len(word) > 3 and model in ("fisheye", "unread")) else ""
 
 
 def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tuple[str, Any]]:
-    """Full key and value of entries of a lens that no reader took, except coefficients that are zero."""
+    """Full key and value of entries of a lens that no reader has read, except coefficients of zero."""
     for key, value in ((str(k), v) for k, v in values.items()):
         path, flat = at + key, _flat(value)
         if isinstance(value, Mapping) and flat is None:
@@ -291,7 +291,7 @@ def _flat(value: Any) -> list[Any] | None:
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
     data, rows, columns = _flat(value["data"]), str(value.get("rows")), str(value.get("cols"))
-    # int() refuses thousands of digits by an error of its own; nine are more than any matrix has.
+    # Nine digits are enough; int() raises another error for thousands of them.
     if data is not None and rows.isdecimal() and columns.isdecimal() and int(rows[:9]) * int(columns[:9]) != len(data):
         return None
     return data

@@ -1,9 +1,9 @@
-"""KITTI's calibration text: a label and numbers a line.
+"""KITTI's calibration text: each line has a label and numbers.
 
 Odometry has ``P0 ... P3``, the raw recordings ``P_rect_00 ... P_rect_03`` beside the cameras before rectification
 (``K_00``, ``D_00``, ``R_00``, ``T_00``), the older Karlsruhe sequences ``P1_roi`` and ``P2_roi``. Projections
-P = K [R | t] are those of the rectified images, and are taken where the file has them. Files of two to four rows of
-twelve numbers without labels are projections, too, in the order of the cameras.
+P = K [R | t] are those of the rectified images, and are preferred. Files of two to four rows of twelve numbers without
+labels are projections too, in the order of the cameras.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from rille.stages.geometry.lens import Lens
 
 PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
 LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d)[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
-"""A label and its first number: the `P1` of OpenCV's YAML is a matrix, or a list in brackets."""
+"""A label and its first number, unlike the `P1` of OpenCV's YAML, a matrix or a list in brackets."""
 
 LEAST_FOCAL = 2.0
-"""Pixels; rows of a pose have the same twelve numbers, but the first three of them are at most 1."""
+"""Pixels; poses have twelve numbers too, but the first three are at most 1."""
 
 
 def is_kitti(text: str) -> bool:
     """Whether a line has the label of a projection, or all are projections without labels."""
-    # The beginning is enough for any calibration. Other files pass here too: `rille init` tries every small text.
+    # The beginning is enough for calibrations; `rille init` tries other texts too.
     return LINE.search(text[:100_000]) is not None or bool(_nameless(text))
 
 
 def _nameless(text: str) -> dict[str, list[str]]:
-    """Rows of projections without labels, by the labels that they would have; none if any row is something else."""
+    """Rows of projections without labels, by the labels that they would have; empty if any row is something else."""
     rows = [line.split() for line in text[:100_000].splitlines() if line.strip()]
     if not 2 <= len(rows) <= 4 or any(len(row) != 12 for row in rows):
         return {}
@@ -74,14 +74,14 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
 def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
     """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
     m = projection[:, :3]
-    # written so that NaN-free but singular matrices are refused before anything divides by them
+    # Refuse singular matrices before anything divides by them.
     if abs(np.linalg.det(m)) < 1e-9:
         text = f"calibration: {name} is singular"
         raise InputError("RIL-203", text, remedy="give P = K [R | t], 12 numbers, row-major")
     if m[1, 0] == m[2, 0] == m[2, 1] == 0.0 and m[2, 2] > 0:
         k, r = m / m[2, 2], np.eye(3)
     else:
-        from scipy.linalg import rq  # not at once: of rectified cameras it is not needed
+        from scipy.linalg import rq  # late, since rectified cameras do not need it
 
         k, r = rq(m * np.sign(np.linalg.det(m)))
         signs = np.sign(np.diag(k))

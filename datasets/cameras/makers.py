@@ -1,4 +1,4 @@
-"""Calibrations as stereo cameras and data sets come with them.
+"""Calibrations of stereo cameras and data sets by their makers.
 
 ZED's ``.conf``, OAK's JSON (DepthAI), ``K.txt``, and Middlebury's rectified pairs (2014 and 2021).
 """
@@ -32,15 +32,15 @@ ZED_SIZES = {
     "QHDPLUS": (3200, 1800),
     "4K": (3840, 2160),
 }
-"""Pixels of the resolutions that a ``.conf`` has a section for."""
+"""Pixels of the resolutions in a ``.conf``."""
 
 
 def zed(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras at each resolution. Lengths in the file are millimetres, here metres.
 
     ``Baseline``, TY and TZ are the translation of ``x_right = R x_left + (-Baseline, TY, TZ)``, RX, CV and RZ the
-    rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). Several resolutions tell their sizes; a
-    single one is taken for that of the images.
+    rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). With several resolutions each has its size;
+    the size of a single one is that of the images.
     """
     parts = {
         name.upper(): entries(((k.lower(), v) for k, v in ENTRY.findall(body)), f"{path} {name}")
@@ -51,7 +51,7 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     cameras = []
     for name in names:
         size = ZED_SIZES.get(name, UNKNOWN_SIZE) if len(names) > 1 else UNKNOWN_SIZE
-        # Newer files have the distortion once, for all resolutions.
+        # Newer files have one distortion for all resolutions.
         left, right = (
             _zed_lens(Fields(parts.get(f"{side}_DISTO", {}) | parts.get(at, {}), str(path), f"{at} "), size)
             for side, at in (("LEFT", f"LEFT_CAM_{name}"), ("RIGHT", f"RIGHT_CAM_{name}"))
@@ -76,7 +76,8 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
 def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
     """The two cameras that the device rectifies for stereo. Lengths in the file are centimetres, here metres.
 
-    ``extrinsics`` map a camera to the one at ``toCameraSocket``; 14 coefficients are OpenCV's, of a fisheye four count.
+    ``extrinsics`` map a camera to the one at ``toCameraSocket``; 14 coefficients are OpenCV's, the first four a
+    fisheye's.
     """
     rows = f.get("cameraData")
     pairs = [row for row in rows if isinstance(row, list) and len(row) == 2] if isinstance(rows, list) else []
@@ -101,7 +102,7 @@ def _depthai_lens(f: Fields) -> Lens:
 
 
 def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
-    """The camera that all others are stated from, and T_root_socket in metres."""
+    """The camera at the root of all extrinsics, and T_root_socket in metres."""
     T, seen = RigidTransform.identity(), set[str]()
     while socket not in seen:
         seen.add(socket)
@@ -116,7 +117,7 @@ def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
 
 
 def numbers_of_matrix(text: str) -> list[str]:
-    """Nine numbers fx 0 cx, 0 fy cy, 0 0 1 that a text holds, and perhaps a tenth; nothing of any other text."""
+    """The nine numbers fx 0 cx, 0 fy cy, 0 0 1 of a text, and perhaps a tenth; empty for any other text."""
     words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
     try:
         k = [float(word) for word in words[:9]]
@@ -127,7 +128,7 @@ def numbers_of_matrix(text: str) -> list[str]:
 
 
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
-    """Two parallel cameras alike, of ``K.txt`` with K row by row and a baseline in metres; without one, a camera."""
+    """Two equal parallel cameras of ``K.txt`` with K row by row and a baseline in metres; one camera if that lacks."""
     fx, _, cx, _, fy, cy, _, _, _, *baseline = numbers_of_matrix(text)
     f = Fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}, str(path))
     lens = f.optics("fx fy cx cy", "none", "", UNKNOWN_SIZE)
@@ -137,7 +138,7 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
-    """Both cameras; the file's baseline is in millimetres, here it is in metres."""
+    """Both cameras; the file's baseline is in millimetres, here in metres."""
     values = entries((line for line in assignments(text) if line[0]), str(path))
     rows = {key: value.strip("[]").replace(";", " ").split() for key, value in values.items() if value.startswith("[")}
     f = Fields(values | rows, str(path))

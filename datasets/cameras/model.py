@@ -1,4 +1,4 @@
-"""One calibrated camera, whoever calibrated it."""
+"""One calibrated camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rille.stages.geometry.geometry import RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
 UNKNOWN_SIZE = (1, 1)
-"""Width and height, pixels, of a camera whose file does not say how large its images are."""
+"""Width and height of a camera whose file does not state the size of its images."""
 
 RECTIFIED = re.compile(r"(?<![a-z])rect(?!ang)|Rect|RECT")
 """In the name of a topic or of a folder of rectified images; not as in unrectified, corrected or direct."""
@@ -23,12 +23,12 @@ class CalibratedCamera:
 
     Attributes
     ----------
-    name : what the file calls it.
-    lens : its optics; the image size is ``UNKNOWN_SIZE`` where the file does not say it.
+    name : in the file.
+    lens : its optics; the image size is ``UNKNOWN_SIZE`` if the file does not state it.
     T_camera_reference : maps the file's reference frame (first camera, body, world ...), the same for all cameras of
-        one calibration, to the optical frame of this camera, in the file's unit of length (metres where the format
-        fixes it); None where the file does not say where the camera stands.
-    rectified : the camera of its rectified images, where the file has that, too.
+        one calibration, to the optical frame of this camera, in the file's unit of length (metres if the format defines
+        it); None if the file does not state the pose.
+    rectified : the camera of its rectified images, if the file has one.
     """
 
     name: str
@@ -38,22 +38,22 @@ class CalibratedCamera:
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height of its images, pixels; None where the file does not say."""
+        """Width and height of its images, pixels; None if the file does not state them."""
         size = (self.lens.camera.width, self.lens.camera.height)
         return None if size == UNKNOWN_SIZE else size
 
 
 def of_size(cameras: list[CalibratedCamera], sizes: Sizes | None) -> list[CalibratedCamera]:
-    """The two of several cameras whose images have these sizes; all where they are not two."""
+    """The two of several cameras whose images have these sizes; all cameras if there are not exactly two."""
     fit = [camera for camera in cameras if sizes is not None and camera.size in sizes]
     return fit if len(fit) == 2 else cameras
 
 
 def parallel(baseline: float) -> RigidTransform:
-    """T_right_left of cameras that look the same way, the right one ``baseline`` along the left one's x axis."""
+    """T_right_left of parallel cameras, the right one ``baseline`` along the left one's x axis."""
     return RigidTransform(np.eye(3), np.array([-baseline, 0.0, 0.0]))
 
 
 def stereo_cameras(left: Lens, right: Lens, T_right_left: RigidTransform) -> list[CalibratedCamera]:
-    """Both cameras of a file that states how the right one stands to the left one, which is the reference."""
+    """Both cameras of a file that states their relative pose; the left one is the reference."""
     return [CalibratedCamera("left", left, RigidTransform.identity()), CalibratedCamera("right", right, T_right_left)]

@@ -1,4 +1,4 @@
-"""Calibrations in the words of OpenCV, and of ROS, which took them over."""
+"""Calibrations with the keys of OpenCV, which ROS uses too."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
 KEY = re.compile(r"(?:(left|right|l|r)[._ ]?)?([a-z._ ]+?)[._ ]?(left|right|l|r|[12])?", re.I)
-"""A key of one side, which stands before or behind what it is."""
+"""A key of one side, with the side before or after the name."""
 
 MATRIX = re.compile(r"m|k|cm|mtx|matrix|cam(era)?(matrix|mtx)|intrinsics?(matrix)?")
 DISTORTION_OF_SIDE = re.compile(r"d|dist(ortion)?(coeff?s?|coefficients)?")
-"""What programs call camera matrix and distortion of one side, in small letters alone."""
+"""Names of camera matrix and distortion of one side, in small letters alone."""
 
 SINGLE = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectification_matrix", "P": "projection_matrix"}
-"""Fields of ROS' message camera_info, in ROS 2 in small letters, and the keys of its files."""
+"""Fields of ROS' message camera_info (small letters in ROS 2), and keys of its files."""
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
 
 
 def sides(f: Fields) -> list[tuple[str, str]]:
-    """Keys of camera matrix and distortion of the left and of the right camera; empty where not both have a matrix."""
+    """Keys of camera matrix and distortion of the left and of the right camera; empty if not both have a matrix."""
     found: dict[tuple[bool, bool], str] = {}
     for key, value in f.values.items():
         parts = KEY.fullmatch(key)
@@ -52,8 +52,8 @@ def sides(f: Fields) -> list[tuple[str, str]]:
 def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Both cameras of OpenCV's stereo samples: M1 D1 M2 D2, R T with ``x_right = R x_left + T``.
 
-    R, T and P1, P2 may stand in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files
-    with LEFT.R and RIGHT.P (rectification, as ORB-SLAM2 keeps it) are read too.
+    R, T and P1, P2 may be in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files
+    with LEFT.R and RIGHT.P (rectification, as in ORB-SLAM2) are read too.
     """
     lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
     poses: tuple[RigidTransform | None, RigidTransform | None]
@@ -69,18 +69,18 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def projections_alone(f: Fields) -> bool:
-    """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before; that is another one."""
+    """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before rectification."""
     return "P1" in f and "P2" in f and not any(key in f for key in (*ROTATIONS, *TRANSLATIONS))
 
 
 def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Both cameras of images that are rectified already."""
+    """Both cameras of rectified images."""
     sides = [_projected(name, f, key, _size(f)) for name, key in (("left", "P1"), ("right", "P2"))]
     return [side for side in sides if side is not None]
 
 
 def reprojection(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Both cameras of rectified images by ``Q`` of OpenCV's ``stereoRectify``, which takes disparities to points."""
+    """Both cameras of rectified images by ``Q`` of OpenCV's ``stereoRectify``, which maps disparities to points."""
     Q = f.matrix("Q", 4, 4)
     if not (Q[2, 3] > 0 and Q[3, 2]):
         raise f.error("RIL-678", "Q", f"has the focal length {Q[2, 3]:g} and the inverse baseline {Q[3, 2]:g}")
@@ -118,16 +118,16 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def _read_out(f: Fields, lens: Lens) -> Lens:
-    """The lens before images of which ROS says that they are a part of the sensor, in pixels of several of its own.
+    """The lens of images that show a part of the sensor, or combine several of its pixels (ROS' roi and binning).
 
-    ``sensor_msgs/msg/CameraInfo`` states the whole sensor's camera, the part in its pixels, and how many are combined.
+    ``sensor_msgs/msg/CameraInfo`` states the whole sensor's camera, the part in its pixels, and the binning.
     """
     x, y = (int(f.number(key, 1)) or 1 for key in ("binning_x", "binning_y"))
     roi = f.sub("roi") if "roi" in f else Fields({}, f.file)
     left, top, width, height = (int(roi.number(key, 0)) for key in ("x_offset", "y_offset", "width", "height"))
     whole = lens.camera
     size = max((width or whole.width) // x, 1), max((height or whole.height) // y, 1)
-    # The centre of a combined pixel lies amid those that it combines.
+    # The centre of a combined pixel lies in the middle of those that it combines.
     centre = (whole.cx - left) / x + (0.5 / x - 0.5), (whole.cy - top) / y + (0.5 / y - 0.5)
     return replace(lens, camera=f.camera("roi", (whole.fx / x, whole.fy / y, *centre), size))
 
@@ -137,14 +137,14 @@ def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Len
     coefficients = f.numbers(distortion) if distortion in f else ()
     model, coefficients = by_count(coefficients)
     stated = f.model(distortion)
-    # ROS writes five zeros for cameras without distortion, whatever the model
+    # ROS writes five zeros for cameras without distortion, whatever the model.
     if stated == "fisheye" or (stated and any(coefficients)):
         model = stated
     return f.lens(distortion, camera, model, coefficients)
 
 
 def _size(f: Fields, side: str = "") -> tuple[int, int]:
-    """Width and height; ``side``: 1 left, 2 right, whose sizes ``rille calibrate`` writes apart if they differ."""
+    """Width and height; ``side``: 1 left, 2 right; ``rille calibrate`` writes both sizes if they differ."""
     for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
             return f.pair_of_pixels(key)
@@ -173,13 +173,13 @@ def _beside(path: Path) -> Fields | None:
 
 
 def _with_rectified(raw: CalibratedCamera, f: Fields, projection: str) -> CalibratedCamera:
-    """With the camera of its rectified images, where the file has that."""
+    """The camera with that of its rectified images, if the file has one."""
     size = raw.lens.camera.width, raw.lens.camera.height
     return replace(raw, rectified=_projected(raw.name, f, projection, size)) if projection in f else raw
 
 
 def _projected(name: str, f: Fields, projection: str, size: tuple[int, int]) -> CalibratedCamera | None:
-    """A camera of rectified images, whose axes are those of the rectified left camera; None where P is empty."""
+    """A camera of rectified images, with the axes of the rectified left camera; None if P is empty."""
     P = f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
         return None
@@ -194,7 +194,7 @@ def _baseline(P: Floats) -> RigidTransform:
 
 
 def _unrectified(f: Fields, rotation: str, projection: str) -> RigidTransform:
-    """T_camera_reference, where the reference is the rectified left camera."""
+    """T_camera_reference; the reference is the rectified left camera."""
     R, P = f.matrix(rotation, 3, 3), f.matrix(projection, 3, 4)
     if not P[0, 0] > 0:
         raise f.error("RIL-125", projection, f"has the focal length {P[0, 0]:g}")

@@ -10,19 +10,19 @@ from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
 
 MAX_OFF_CENTRE = 0.1
-"""Share of an image's width by which a principal point usually lies off the centre at most."""
+"""Usual largest distance of a principal point from the centre, over the image's width."""
 
 
 def check_focal(camera: Camera, name: str) -> None:
-    """Refuse a focal length that no lens has before images of this size.
+    """Refuse a focal length that is impossible for images of this size.
 
     Raises
     ------
     InputError
-        It is one.
+        It is impossible.
     """
     for f, what, side in ((camera.fx, "fx", camera.width), (camera.fy, "fy", camera.height)):
-        # The angle of view is 169 or 0.06 degrees; a fisheye, with a longer one, sees a full circle at most.
+        # Angles of view of 169 and 0.06 degrees; a fisheye has a longer focal length, even for a full circle.
         if not 0.05 <= f / side <= 1000.0:
             size = f"{camera.width} x {camera.height} pixels"
             text = f"camera {name}: {what} = {f:g} px cannot be that of images of {size}"
@@ -37,19 +37,19 @@ def rig_of(
     Parameters
     ----------
     left, right : cameras whose poses refer to one frame.
-    sizes : of the images; needed where the calibration does not say.
+    sizes : of the images; needed if the calibration does not state them.
 
     Returns
     -------
     rig : with ideal cameras (:meth:`rille.stages.geometry.lens.Lens.ideal_camera`), in the calibration's unit of
         length.
-    lenses : by camera, ``"left"`` and ``"right"``, only where there is distortion; None where there is none at all.
+    lenses : by camera, ``"left"`` and ``"right"``, only those with distortion; None if there are none.
 
     Raises
     ------
     InputError
-        The image size or the relative pose is not known, the images are of another size than the calibration's, a focal
-        length cannot be, the cameras stand in one place, or are swapped.
+        The image size or the relative pose is unknown, the images have another size than the calibration's, a focal
+        length is impossible, or the cameras stand in one place, or are swapped.
     """
     of_left, of_right = sizes or (None, None)
     if sizes is not None:
@@ -64,12 +64,12 @@ def rig_of(
         raise InputError("RIL-128", text, remedy="give the baseline in metres, or a stereo calibration")
     T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
-    # Below this, in any unit of length in use, both cameras stand in one place
+    # 1e-6: below, in any usual unit of length, both cameras stand in one place.
     if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
         raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
     to_the_right = float(rig.centre[0])
-    # A rig whose baseline is rather vertical has no sides.
+    # A rig with a mainly vertical baseline has no sides.
     if to_the_right < -0.5 * rig.baseline:
         raise InputError(
             "RIL-130",
@@ -83,12 +83,12 @@ def rig_of(
 
 
 def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> None:
-    """Refuse images of another scale than a calibration that states no size, as its principal points show."""
+    """Refuse images of another scale than a calibration without sizes, by its principal points."""
     both = tuple(camera.lens.camera for camera in cameras)
     if any(camera.size is not None for camera in cameras) or min(min(c.cx, c.cy) for c in both) <= 0:
         return
     scales = [(width / (2 * c.cx + 1), height / (2 * c.cy + 1)) for c, (width, height) in zip(both, sizes, strict=True)]
-    # Where columns and rows differ, images were cut, or principal points are off: neither can be told from the other.
+    # If columns and rows differ, images were cropped, or principal points are off-centre: the scale is unknown.
     if any(max(one) > 1.1 * min(one) for one in scales):
         return
     for camera, c, one, (width, height) in zip(cameras, both, scales, sizes, strict=True):
@@ -109,8 +109,7 @@ def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
     """Refuse a camera whose principal point is the centre of its images, of this size, if cx and cy are exchanged."""
     c = camera.lens.camera
     off, exchanged = (max(abs(x - width / 2), abs(y - height / 2)) for x, y in ((c.cx, c.cy), (c.cy, c.cx)))
-    # 4.0: times as far off the centre as with columns and rows exchanged: then these are exchanged, and nothing was
-    # cut.
+    # 4.0: distance from the centre over that with columns and rows exchanged above which these are exchanged.
     if off > max(4.0 * exchanged, 0.5 * MAX_OFF_CENTRE * width):
         text = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name} would be the centre of"
         remedy = "exchange them; or, if the images were turned, turn them back"
@@ -125,7 +124,7 @@ def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
         if camera.size == size[::-1]:
             remedy += " (turned by their tag: magick mogrify -auto-orient FILES; or its width and height are exchanged)"
         elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
-            # The centre of the first pixel is 0: its corner stays where it is.
+            # The centre of the first pixel is at 0, and its corner stays in place.
             cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
             focal = f"fx = {c.fx * scale:.8g}, fy = {c.fy * scale:.8g}"
             remedy += f"; if they were scaled, it has {focal}, cx = {cx:.8g}, cy = {cy:.8g} and the same distortion"

@@ -24,23 +24,23 @@ GROUP = re.compile(r"^[ \t]*(?:GROUP|OBJECT)[ \t]*=[ \t]*\"?GEOMETRIC_CAMERA_MOD
 GROUP_END = re.compile(r"^[ \t]*END_(?:GROUP|OBJECT)\b", re.MULTILINE)
 PROPERTY = re.compile(r"\bPROPERTY='GEOMETRIC_CAMERA_MODEL[A-Z_]*'")
 PROPERTY_END = re.compile(r"\b(?:PROPERTY|TASK)='")
-# Repeats are bounded, here and below: a hostile label must not cost more than its length.
+# Repeats are bounded, here and below, so that the time for a hostile label is linear in its length.
 COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(),]{1,60})")
 TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
 UNIT = re.compile(r"<[^<>]{0,40}>")
 
 COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
-"""Components that each model has at least."""
+"""Fewest components of each model."""
 
 
 def attached(path: Path) -> str:
-    """The label at the beginning of a file that is an image; empty where it has none."""
-    # bytes; images with a label are large
+    """The label at the beginning of an image file; empty if it has none."""
+    # 2**31 bytes: images with a label are large.
     with open_regular(path, "calibration", 2**31) as file:
         start = file.read(16)
         if not start.startswith(BEGINS):
             return ""
-        # latin-1 decodes any byte: behind the label stands the image.
+        # latin-1 decodes any byte, since the image follows the label.
         text = (start + file.read(SMALL)).decode("latin-1")
     if text.startswith("LBLSIZE="):
         size = re.match(r"LBLSIZE=(\d{1,7})\b", text)
@@ -57,7 +57,7 @@ def is_label(text: str) -> bool:
 def label(text: str, path: Path) -> list[CalibratedCamera]:
     """The camera, named by its file; its pose refers to the label's frame. The lens is that of far points.
 
-    The image size is unknown: it is that of the images.
+    The image size is unknown.
     """
     f = _entries(text, path)
     kind = f.text("MODEL_TYPE")
@@ -104,7 +104,7 @@ def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
     camera = f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE)
     axes = np.array([x, y, a])
     T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ model.c)
-    # 1e-6 of the focal length: columns and rows are perpendicular then.
+    # 1e-6 of the focal length: below, columns and rows are perpendicular.
     if not any(model.radial) and model.linearity == 1.0 and abs(skew) <= 1e-6 * fy:
         lens = Lens(camera)
     else:
@@ -133,7 +133,7 @@ def _entries(text: str, path: Path) -> Fields:
 
 def _unit(f: Fields, key: str, vector: np.ndarray) -> np.ndarray:
     length = float(np.linalg.norm(vector))
-    # By which A and O, as they are written, may miss it
+    # 1e-3: largest error of A and O by the digits of the label.
     if not abs(length - 1.0) < 1e-3:
         raise f.error("RIL-954", key, f"has the length {length:.6g}, it should be a unit vector")
     return np.asarray(vector / length)

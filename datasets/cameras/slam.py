@@ -22,13 +22,14 @@ CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
     "KANNALA_BRANDT": ("mu mv u0 v0", "fisheye", "k2 k3 k4 k5"),
     "MEI": ("gamma1 gamma2 u0 v0", "radtan", "k1 k2 p1 p2"),
 }
-"""Its models: keys of the pinhole part, model of :mod:`rille.stages.geometry.lens`, keys of its coefficients."""
+"""Models of camodocal: keys of the pinhole part, model of :mod:`rille.stages.geometry.lens`, keys of its coefficients.
+"""
 
 
 def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of a chain: ``T_cn_cnm1`` maps camera n - 1 to camera n, metres.
 
-    Where not all have it, ``T_cam_imu`` or its inverse ``T_imu_cam`` (OpenVINS) says how they stand to the IMU.
+    If not all have it, poses are those against the IMU, by ``T_cam_imu`` or its inverse ``T_imu_cam`` (OpenVINS).
     """
     names = sorted((key for key in f.values if CAMERA.fullmatch(key)), key=lambda key: int(key[3:]))
     parts = [f.sub(name) for name in names]
@@ -36,7 +37,7 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     poses = [RigidTransform.identity() if whole else _of_imu(parts[0])]
     for part in parts[1:]:
         T, before = (None if whole else _of_imu(part)), poses[-1]
-        # Each camera is stated from the one before, so that poses multiply along the chain.
+        # Each pose is relative to the camera before, so that poses multiply along the chain.
         poses.append(part.pose("T_cn_cnm1") @ before if T is None and before and "T_cn_cnm1" in part else T)
     return [
         CalibratedCamera(name, _pinhole_lens(part, "distortion_coeffs"), T)
@@ -53,7 +54,7 @@ def _of_imu(part: Fields) -> RigidTransform | None:
 def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
     """The camera; ``extrinsicRotation`` and ``extrinsicTranslation`` map it to the body (VINS-Mono), metres."""
     kind = f.text("model_type").upper()
-    # Without its mirror, Mei's unified model is a pinhole camera's.
+    # With xi = 0 Mei's unified model is a pinhole camera.
     xi = f.sub("mirror_parameters").number("xi") if kind == "MEI" else 0.0
     if kind not in CAMODOCAL or xi:
         text = f"= {kind} (xi = {xi:g}) is not read" if xi else f"= {kind} is not read"
@@ -68,7 +69,7 @@ def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Cameras of the files that ``cam0_calib`` ... name; ``body_T_cam0`` ... map each to the body, metres."""
+    """Cameras of the files named by ``cam0_calib`` ...; ``body_T_cam0`` ... map each to the body, metres."""
     cameras = []
     for name in sorted(key[:4] for key in f.values if re.fullmatch(r"cam\d_calib", key)):
         other = path.parent / f.text(f"{name}_calib")
@@ -102,7 +103,7 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Camera or cameras of ORB-SLAM's settings.
 
-    Version 2: both cameras alike and parallel, ``Camera.bf`` = baseline times fx; its sign is ignored. Version 3:
+    Version 2: equal parallel cameras, ``Camera.bf`` = baseline times fx; its sign is ignored. Version 3:
     ``Camera1``, ``Camera2`` and ``Stereo.T_c1_c2``, or ``Stereo.b`` of rectified images. Lengths are metres.
     """
     first = "Camera1" if "Camera1.fx" in f else "Camera"

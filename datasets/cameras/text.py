@@ -16,16 +16,16 @@ from rille.datasets.text.reading import DEEPEST
 from rille.stages.core.errors import InputError
 
 MOST_VALUES = 100_000
-"""Of a YAML file; a stereo calibration has a hundred, with the corners of all its views some ten thousand."""
+"""Most values of a YAML file; a stereo calibration has a hundred, with corners of all views some ten thousand."""
 
 HEADER = re.compile(r"\A%YAML:[0-9.]+[^\n]*\n(\s*---[^\n]*\n)?")
 """OpenCV's first lines, which no YAML parser accepts."""
 
 END = re.compile(r"^---[ \t]*$", re.MULTILINE)
-"""What ROS prints behind each message; to YAML a second document begins there."""
+"""Line that ROS prints after each message; in YAML it begins a second document."""
 
 STAMPED = re.compile(r"\A\s*header:[ \t]*\n([ \t]+.*\n)*")
-"""What is another one in each message of a topic."""
+"""The header, which differs between messages of a topic."""
 
 TWICE = "{} stands there twice, with two values"
 
@@ -33,10 +33,10 @@ C_OR_PYTHON: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 class _Loader(C_OR_PYTHON):  # type: ignore[misc]
-    """YAML whose values stay text, as in XML: no tag, date, merge key or number means anything to the parser."""
+    """YAML whose values stay text, as in XML: the parser interprets no tag, date, merge key or number."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Mapping[Any, Any]:
-        """Entries, of which none may contradict another one."""
+        """Entries; no key may have two values."""
         found: Mapping[Any, Any] = super().construct_mapping(node, deep=True)
         for key, value in node.value:
             if self.construct_object(value, deep=True) != found[self.construct_object(key, deep=True)]:
@@ -44,7 +44,7 @@ class _Loader(C_OR_PYTHON):  # type: ignore[misc]
         return found
 
     def construct_scalar(self, node: Any) -> Any:
-        """Text, or None where it says that there is nothing."""
+        """Text, or None for null."""
         text = super().construct_scalar(node)
         return None if text in ("", "~", "null") else text
 
@@ -79,10 +79,10 @@ def parse_nested(text: str, file: str) -> Mapping[Any, Any]:
 
 
 def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
-    """Entries of a YAML or JSON file; empty where it holds something else than entries."""
+    """Entries of a YAML or JSON file; empty if it has none."""
     body = _first(HEADER.sub("", text, count=1))
     try:
-        # Events are flat and cheap: what would be nested or multiplied is seen before anything is built.
+        # Events are cheap, and show nesting and aliases before anything is built.
         _check_extent(body, file)
         found = yaml.load(body, Loader=_Loader)
     except yaml.YAMLError as error:
@@ -94,7 +94,7 @@ def parse_yaml(text: str, file: str) -> Mapping[Any, Any]:
 
 
 def _first(text: str) -> str:
-    """The first of several messages that say the same; the last of them may break off, as printing was ended."""
+    """The first of several equal messages; the last one may be incomplete."""
     messages = [part for part in END.split(text) if part.strip()]
     stated = [STAMPED.sub("", message).strip() for message in messages]
     same = all(stated[0].startswith(others) for others in stated[1:])
@@ -102,7 +102,7 @@ def _first(text: str) -> str:
 
 
 def _check_extent(text: str, file: str) -> None:
-    """Refuse what is small as text and huge as entries, before anything is made of it."""
+    """Refuse a small text with a huge number of entries, before any is made."""
     depth = values = 0
     for event in yaml.parse(text, Loader=_Loader):
         # Ten lists of ten aliases, each to the list before, make 10^10 values of a few hundred bytes.
@@ -120,12 +120,12 @@ def _check_extent(text: str, file: str) -> None:
 
 
 def parse_xml(text: str, file: str) -> Mapping[str, Any]:
-    """Entries of OpenCV's XML storage; empty where it is another XML file.
+    """Entries of OpenCV's XML storage; empty for other XML files.
 
     Raises
     ------
     InputError
-        The file is not well formed, or declares entities (which expand without bound, and no calibration needs).
+        The file is not well formed, or declares entities (which may expand without bound).
     """
     if "<!ENTITY" in text:
         raise InputError(
@@ -144,7 +144,7 @@ def _node(node: ElementTree.Element, file: str, depth: int = 2) -> Any:
     if depth > DEEPEST:
         raise InputError("RIL-756", f"{file} is nested more than {DEEPEST} levels deep", remedy="correct the file")
     if len(node):
-        # Items of a list have all the same tag.
+        # Items of a list have one tag.
         values = entries(((child.tag, _node(child, file, depth + 1)) for child in node if child.tag != "_"), file)
         if node.get("type_id") == "opencv-matrix" and isinstance(values.get("data"), str):
             values["data"] = values["data"].split()

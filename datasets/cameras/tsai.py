@@ -21,7 +21,7 @@ from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 
 LENSES = {"null": ("none", ""), "fisheye": ("fisheye", "k1 k2 k3 k4"), "tsai": ("radtan", "k1 k2 p1 p2")}
-"""Its lens models that are read: those of :mod:`rille.stages.geometry.lens`, and the keys of their coefficients."""
+"""Supported lens models: those of :mod:`rille.stages.geometry.lens`, and the keys of their coefficients."""
 
 HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 
@@ -34,7 +34,7 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
         raise f.error("RIL-146", "pitch", f"= {pitch:g} is not positive")
     fu, fv, cu, cv = (f.number(key) / pitch for key in ("fu", "fv", "cu", "cv"))
     camera = f.camera("fu", (fu, fv, cu, cv), UNKNOWN_SIZE)
-    # with the directions as rows, the projection is K axes R^T (P - C)
+    # With the directions as rows the projection is K axes R^T (P - C).
     keys = ("u_direction", "v_direction", "w_direction")
     axes = np.array([f.numbers(key, 3) if key in f else row for key, row in zip(keys, np.eye(3), strict=True)])
     if np.linalg.det(axes) < 0:
@@ -48,7 +48,7 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _entries(text: str, file: str) -> tuple[Fields, str]:
-    """Entries ``key = numbers``, and the name of the lens model, which stands alone on its line."""
+    """Entries ``key = numbers``, and the name of the lens model, alone on its line."""
     lines = assignments(text)
     values = entries(((key, value.split()) for key, value in lines if key), file)
     lens = next((value for key, value in lines if not key and not HEADER.fullmatch(value)), "")

@@ -1,4 +1,4 @@
-"""Image files that are still being written: which of them are whole."""
+"""Image files that are still being written: detect which are complete."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from rille.datasets.images.files import Digests, read_grey
 from rille.stages.core.errors import InputError
 
 SETTLE_SECONDS = 0.5
-"""Time for which size and modification time of a file must rest before it is looked into."""
+"""Seconds without a change of size and modification time before a file is read."""
 
 WRITTEN = "is still being written"
 
 
 @dataclass
 class _Seen:
-    """A file as it was seen last; ``trouble`` says why it is not whole, empty: it is."""
+    """A file as it was seen last; ``trouble``: why it is incomplete; empty: it is complete."""
 
     size: int
     changed_ns: int
@@ -26,11 +26,11 @@ class _Seen:
 
 
 class Arrivals(Digests):
-    """Files of a sequence whose images arrive: a file counts once it rests and decodes.
+    """Files of a sequence whose images arrive: a file counts once it no longer changes, and decodes.
 
     Attributes
     ----------
-    changed : when a file was last seen to be new or different, by the monotonic clock, s.
+    changed : time when a file was last new or changed, by the monotonic clock, s.
     """
 
     growing = True
@@ -41,10 +41,10 @@ class Arrivals(Digests):
         self._seen: dict[Path, _Seen] = {}
 
     def whole(self, path: Path) -> bool:
-        """Whether the file has rested and decodes; one that changes is looked into anew."""
+        """Whether the file no longer changes, and decodes."""
         try:
             status = path.stat()
-        except OSError:  # it has gone since the folder was listed
+        except OSError:  # removed since the folder was listed
             return False
         now, path = time.monotonic(), path.resolve()
         seen = self._seen.get(path)
@@ -61,10 +61,10 @@ class Arrivals(Digests):
         return not seen.trouble
 
     def first_seen(self, path: Path) -> float:
-        """When the file was first seen as it is now, by the monotonic clock, s."""
+        """Time when the file was first seen in its present state, by the monotonic clock, s."""
         return self._seen[path.resolve()].since
 
     def troubles(self) -> list[str]:
-        """Why files that are there are not whole, one line each."""
+        """Why files are incomplete, one line each."""
         there = ((path, seen.trouble) for path, seen in self._seen.items() if seen.trouble and path.exists())
         return [f"{path} {WRITTEN}" if trouble == WRITTEN else trouble for path, trouble in there]

@@ -1,4 +1,4 @@
-"""Stage ``image`` for images in ROS bags: one message, checked and grey. And how bags are opened."""
+"""Open ROS bags; stage ``image`` for their images: one message, checked and grey."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
         for bits in (8, 16)
     },
 }
-"""Samples a pixel, bits a sample and OpenCV's conversion to grey, by the encoding of ``sensor_msgs/msg/Image``."""
+"""Samples per pixel, bits per sample and OpenCV's conversion to grey, by encoding of ``sensor_msgs/msg/Image``."""
 
 
 MAX_UNPACKED_BYTES = 2 << 30
-"""Memory in which a bag is read, beside what the process has already: chunks and messages have some MB, but may unpack
-to any size, whatever they state."""
+"""Most additional memory for a bag: chunks and messages have some MB, but may unpack to any size, whatever they
+state."""
 
 _LIMITS = resource.getrlimit(resource.RLIMIT_AS)
 
 
 class Message(NamedTuple):
-    """Where a message lies: ``path`` of the bag, ``topic``, and ``at``, the time when it was recorded, ns."""
+    """Place of a message: ``path`` of the bag, ``topic``, and ``at``, the time of its recording, ns."""
 
     path: str
     topic: str
@@ -84,7 +84,7 @@ def opened(path: Path) -> Iterator[Any]:
     most = psutil.Process().memory_info().vms + MAX_UNPACKED_BYTES
     try:
         resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(soft, most), hard))
-        # bags of ROS 2 before Iron hold no definitions of their messages
+        # Bags of ROS 2 before Iron hold no definitions of their messages.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
     except RilleError:
@@ -92,7 +92,7 @@ def opened(path: Path) -> Iterator[Any]:
     except MemoryError as error:
         text = f"{path} cannot be read in {MAX_UNPACKED_BYTES / 2**30:g} GiB: a chunk or message of it unpacks to more"
         raise InputError("RIL-939", text, remedy="no recorder does that: write it anew in chunks of some MB") from error
-    except Exception as error:  # of a damaged bag: whatever the parsers of five formats come upon
+    except Exception as error:  # a damaged bag: parsers of five formats raise anything
         reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         text = f"{path} cannot be read as a bag: {reason}"
         remedy = "copy it again; `mcap recover` or `rosbag reindex` mends a recording that broke off"
@@ -102,7 +102,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def depth(message: Any, name: str) -> Header:
-    """Width, height and bits of the image of a message; one that is damaged further on costs its frame alone."""
+    """Width, height and bits of the image of a message, from its beginning: later damage costs the frame alone."""
     if hasattr(message, "format"):
         return files.usable(read_header(BytesIO(bytes(message.data))), name)
     return Header(int(message.width), int(message.height), _layout(message, name)[1])
@@ -114,8 +114,8 @@ def grey_of(message: Any, name: str, wanted: Header) -> Grey:
     Parameters
     ----------
     message : ``sensor_msgs/msg/Image`` or ``CompressedImage``.
-    name : what to call it in an error.
-    wanted : what it must have.
+    name : for errors.
+    wanted : required size and depth.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def grey_of(message: Any, name: str, wanted: Header) -> Grey:
     rows, columns, step = int(message.height), int(message.width), int(message.step)
     files.check_size(Header(columns, rows, bits), wanted, name)
     width = columns * samples * bits // 8
-    # Rows may be padded to `step` bytes (sensor_msgs/msg/Image), and the message may hold fewer than it states.
+    # Rows may be padded to `step` bytes (sensor_msgs/msg/Image), and data may be missing.
     data = np.frombuffer(bytes(message.data), np.uint8)
     if step < width or len(data) < rows * step:
         text = f"{name} has {len(data)} bytes in rows of {step}, {columns} x {rows} pixels need rows of {width}"

@@ -1,9 +1,9 @@
-"""Corners of a chessboard in images: its size, where they are, and which is which in both images of a pair.
+"""Corners of a chessboard in images: size of the board, positions, and equal order in both images of a pair.
 
-Detection is OpenCV's: by squares, then by sectors (Duda, Frese 2018) for what that misses. Both are refined alike: on
-rendered boards the second alone errs by 0.13 - 0.28 px RMS, refined by 0.02 - 0.05, and on real ones all parameters are
-then the same whichever found the corners. A board turned by half a turn may look the same. So the order of the corners
-is only made equal in the two images of a pair, which is all that a calibration needs.
+Detection is OpenCV's: by squares, then by sectors (Duda, Frese 2018) for boards that the first misses. Both are refined
+alike: on rendered boards the second alone errs by 0.13 - 0.28 px RMS, refined by 0.02 - 0.05, and on real ones
+calibrated parameters are then the same for both. A board may look the same after half a turn, so the order of the
+corners is only made equal in the two images of a pair, which is enough for a calibration.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from rille.stages.core.errors import ConfigError, InputError
 Grey = NDArray[np.uint8]
 
 LEAST_SIDE = 3
-"""Inner corners along a side, below which a pattern cannot be distinguished from clutter."""
+"""Fewest inner corners along a side that distinguish a board from clutter."""
 
 QUICK = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 THOROUGH = (
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE,
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE,
 )
-"""Attempts: by squares, in hundredths of a second, and by the sectors about each corner, in tenths of one."""
+"""Flags of two attempts by the sectors about each corner, in tenths of a second; squares take hundredths of one."""
 
 
 def parse_corners(text: str) -> tuple[int, int]:
@@ -58,7 +58,7 @@ def board_points(corners: tuple[int, int], square: float) -> Floats:
     ConfigError
         ``square`` is not a plausible length in metres.
     """
-    # m; no printed board has squares as large: a length in millimetres or centimetres
+    # 1 m: larger squares are lengths in millimetres or centimetres.
     if not 0 < square <= 1.0:
         guess = next((square / unit for unit in (100.0, 1000.0) if 0.005 <= square / unit <= 0.2), square / 1000.0)
         hint = f"; did you mean {guess:g}?" if square > 0 else ""
@@ -68,7 +68,7 @@ def board_points(corners: tuple[int, int], square: float) -> Floats:
 
 
 def eight_bit(image: AnyArray) -> Grey:
-    """Grey image as uint8, which the detection takes; 16-bit ones are stretched to their own range."""
+    """Grey image as uint8, for the detection; 16-bit ones are stretched to their range."""
     if image.dtype == np.uint8:
         return np.asarray(image, dtype=np.uint8)
     low, high = np.percentile(image, [0.1, 99.9])
@@ -77,10 +77,10 @@ def eight_bit(image: AnyArray) -> Grey:
 
 
 def find_size(images: Iterable[Grey]) -> tuple[int, int]:
-    """Inner corners (more, fewer) of the board that most of the images show.
+    """Inner corners (more, fewer) of the board in most of the images.
 
-    A single image may show a part of the board, or find a pattern in its surroundings; the same size in most of them is
-    no accident.
+    In a single image a part of the board, or a pattern of the surroundings, may be detected; the same size in most of
+    them is no accident.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
 
 
 def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
-    """All inner corners (n, 2) column, row of a board, row by row; None where it is not found whole."""
+    """All inner corners (n, 2) column, row of a board, row by row; None if they are not all found."""
     attempts = [(cv2.findChessboardCorners, QUICK), *((cv2.findChessboardCornersSB, flags) for flags in THOROUGH)]
     for find, flags in attempts:
         found, points = find(image, corners, flags=flags)
@@ -112,27 +112,26 @@ def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
 
 
 def is_board(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
-    """Whether corners (n, 2) are those of a chessboard: steady steps, and squares dark and bright by turns."""
+    """Whether corners (n, 2) are those of a chessboard: steady steps, and alternating squares."""
     return steady(points, corners) and alternates(image, points, corners)
 
 
 def steady(points: AnyArray, corners: tuple[int, int]) -> bool:
-    """Whether the steps between corners (n, 2) along rows and columns change slowly, as those of a plane do."""
+    """Whether the steps between corners (n, 2) along rows and columns change slowly, as on a plane."""
     grid = np.asarray(points, dtype=np.float64).reshape(corners[1], corners[0], 2)
     for along in (grid, grid.transpose(1, 0, 2)):
         steps = np.diff(along, axis=0)
         length = np.linalg.norm(steps, axis=-1)
         bend = np.linalg.norm(np.diff(steps, axis=0), axis=-1)
-        # Change from one step between corners to the next, as a share of their mean length. A board tilted by 45
-        # degrees at three times its width, or seen through a wide lens, stays below 0.2; corners of clutter exceed
-        # 0.5.
+        # 0.35: change from one step between corners to the next over their mean length. A board tilted by 45 degrees at
+        # three times its width, or seen through a wide lens, has less than 0.2, clutter more than 0.5.
         if (bend > 0.35 * (length[1:] + length[:-1]) / 2).any():
             return False
     return True
 
 
 def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
-    """Whether the squares between corners (n, 2) are dark and bright by turns, as clutter in a street is not."""
+    """Whether the squares between corners (n, 2) are dark and bright by turns, unlike clutter."""
     grid = np.asarray(points, dtype=np.float32).reshape(corners[1], corners[0], 2)
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     grey = cv2.remap(image, middles[..., 0], middles[..., 1], cv2.INTER_LINEAR).astype(np.float64)
@@ -141,16 +140,16 @@ def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
     bright = even if grey[even].mean() > grey[~even].mean() else ~even
     signed = np.where(bright, grey, -grey)  # the sum of two that touch is bright less dark
     steps = np.concatenate([(signed[1:] + signed[:-1]).ravel(), (signed[:, 1:] + signed[:, :-1]).ravel()])
-    # Between squares that touch, as a share of the range of all squares: print under a shadow keeps more
+    # 0.1: difference of adjacent squares over the range of all squares; print under a shadow has more.
     return bool(steps.min() > 0.1 * np.ptp(grey))
 
 
 def refine(image: Grey, points: AnyArray, corners: tuple[int, int]) -> Floats:
-    """Corners (n, 2) moved to where all grey value gradients about them point past them."""
+    """Corners (n, 2) refined by the grey value gradients around them (OpenCV's cornerSubPix)."""
     grid = np.asarray(points).reshape(corners[1], corners[0], 2)
     spacing = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))
-    # Half the side of the window about a corner, as a share of the corners' least spacing: clear of the next corner's
-    # edges, and as many pixels as that leaves. Half of it doubles the noise, twice of it meets the neighbours.
+    # 0.25: half side of the window around a corner over the least spacing of corners, as large as possible without
+    # edges of the next corner. Half of it doubles the noise, twice of it reaches the neighbours.
     reach = int(np.clip(0.25 * spacing, 2, 11))
     start = np.array(grid, dtype=np.float32).reshape(-1, 1, 2)
     settled = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4
@@ -161,8 +160,8 @@ def refine(image: Grey, points: AnyArray, corners: tuple[int, int]) -> Floats:
 def same_order(left: Floats, right: Floats, corners: tuple[int, int]) -> Floats:
     """The right image's corners (n, 2) in the order of the left one's.
 
-    Of all orders in which a grid can be read, the one in which both patterns lie alike: right as long as the cameras
-    are rolled against each other by less than a quarter of a turn (an eighth for a board with as many rows as columns).
+    Of all orders of a grid it is the one by which both patterns are most alike: right if the roll between the cameras
+    is less than a quarter of a turn (an eighth for a board with as many rows as columns).
     """
     columns, rows = corners
     grid = right.reshape(rows, columns, 2)

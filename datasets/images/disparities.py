@@ -1,4 +1,4 @@
-"""Stage ``disparity``: disparities of a left image that another program wrote; and which of its files is which pair's.
+"""Stage ``disparity``: disparities of a left image by another program; and the assignment of its files to pairs.
 
 Files are PFM, TIFF and npy of floating point, pixels, or PNG of 16 bits as KITTI has them.
 """
@@ -30,12 +30,12 @@ KINDS = "PFM, TIFF or npy of floating point (pixels), or 16-bit PNG (256 a pixel
 
 
 def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
-    """Values of an encoded map (row, col), from the top; NaN where they are no finite number, 0, or marked as no data.
+    """Values of an encoded map (row, col), from the top; NaN where they are not finite, 0, or marked as no data.
 
     Parameters
     ----------
-    size : width and height that it must have, compared before anything is unpacked.
-    name : what to call it in an error.
+    size : required width and height, compared before anything is unpacked.
+    name : for errors.
 
     Raises
     ------
@@ -44,17 +44,17 @@ def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
     """
     try:
         with catch_warnings(action="ignore"):
-            # How files of NumPy begin
+            # First bytes of NumPy's files.
             values = _numpy(data, size) if data.startswith(b"\x93NUMPY") else _image(data, size)
             values = values.astype(np.float32)
-    except Exception as error:  # whatever the parser of a damaged file comes upon
+    except Exception as error:  # parsers of a damaged file raise anything
         text = f"{name} cannot be read as a map of disparities: {' '.join(str(error).split())[:100]}"
         raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
     return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
 
 
 def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> None:
-    """Refuse, by a ``ValueError``, a map of another size, or of values that may be in any unit."""
+    """Refuse, by a ``ValueError``, a map of another size, or of integers, whose unit is unknown."""
     if size != wanted:
         words = [" x ".join(map(str, sides)) for sides in (size, wanted)]
         raise ValueError(f"it has {words[0]} values, the left image {words[1]} pixels")
@@ -63,7 +63,7 @@ def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> No
 
 
 def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
-    """An array of NumPy; nothing in it is executed, and no more is allocated than the file has."""
+    """An array of NumPy, without execution of any content, and without more memory than the file has."""
     file = BytesIO(data)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
@@ -72,14 +72,13 @@ def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
 
 
 def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
-    """An image whose values are no grey levels."""
+    """An image of disparities."""
     image = opened(BytesIO(data))
     if image is None:
         raise ValueError("it is of no kind that is read")
     coded = image.format == "PNG" and image.mode == "I;16"
     _check(image.size, size, coded or image.mode == "F")
-    # Values of a 16-bit PNG a pixel
-    # PFM's rows, which run from the bottom, and the byte order in its sign are Pillow's business.
+    # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
     values = np.asarray(image, np.float32) / (256 if coded else 1)
     # GDAL's tag of TIFF: value of the pixels without data.
     if image.format == "TIFF" and 42113 in image.tag_v2:
@@ -88,7 +87,7 @@ def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
 
 
 def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path]:
-    """The map of each left image, by name (sides' tokens aside) or number; by order where names have nothing in common.
+    """The map of each left image, by name (without sides' tokens) or number; by order if names have nothing in common.
 
     Parameters
     ----------
@@ -106,7 +105,7 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
     for name in (lambda path: without_side(path.stem, 0), _number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
         if len(ours) < len(maps) or len(theirs) < len(lefts):
-            continue  # it does not tell them apart
+            continue  # keys are not unique
         if ours.keys() >= theirs.keys():
             return [ours[one] for one in theirs]
         if not (lacking or ours.keys().isdisjoint(theirs)):

@@ -1,4 +1,4 @@
-"""Stage ``image``: one image file, checked and grey. Also checks of image files for the readers of folders."""
+"""Stage ``image``: one image file, checked and grey. Also checks of image files for readers of folders."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.levels import Levels, spread, swapped
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says on stderr, an error says here
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # errors here replace its messages on stderr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".bmp")
-"""Kinds of image that are looked for where no pattern is given."""
+"""Endings of image files that are searched for without a pattern."""
 
 MOST_PIXELS = 160_000_000
-"""Of one image: the largest sensors have 150 million."""
+"""Most pixels of one image: the largest sensors have 150 million."""
 
 MOST_BYTES = 2**29
-"""Of one image file."""
+"""Most bytes of one image file."""
 
 FEWER_BITS = "save it with 8 or 16 bits a sample, without sign"
 COPY_AGAIN = "copy the file again, or remove it"
 EXCHANGE = 'python -c "import sys, cv2; [cv2.imwrite(f, cv2.imread(f, -1).byteswap()) for f in sys.argv[1:]]"'
 
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II", b"MM")
-"""How files begin."""
+"""First bytes of files."""
 
 ENDS = {PNG[:2]: b"IEND", JPEG: b"\xff\xd9"}
-"""What nothing else ends a file with, by its first two bytes."""
+"""End markers by the first two bytes of a file."""
 
 _STDERR = threading.Lock()
 
@@ -64,13 +64,13 @@ Grey = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 def _damage(data: bytes) -> str:
-    """Why a file cannot be whole, in words, or nothing: decoders may deliver a truncated one as partly black."""
+    """Damage of a file, in words; empty: none. Decoders may return partly black images of truncated files."""
     if not data:
         return "is empty"
     if data.startswith(PNG):
         try:
             opened(BytesIO(data)).verify()
-        except Exception as error:  # whatever the parser of a damaged file comes upon
+        except Exception as error:  # parsers of damaged files raise anything
             return f"is damaged or truncated ({' '.join(str(error).split())[:100]})"
     return ""
 
@@ -80,10 +80,9 @@ def _damaged(text: str) -> InputError:
 
 
 def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
-    """Image of an encoded file as it is stored, None: it cannot be decoded; and what speaks against it, in words.
+    """Image of an encoded file as stored, None if it cannot be decoded; and its damage, in words.
 
-    libjpeg tells of damage on the process's stderr alone, where other threads may write, too; and gives some image all
-    the same.
+    libjpeg reports damage only on the process's stderr, where other threads may write too, and still returns an image.
     """
     if not data.startswith(JPEG):
         return _decoded(data), ""
@@ -104,26 +103,26 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
         os.write(2, LIBJPEG.sub(b"", said))
     complaints = "; ".join(match[0].decode(errors="replace").strip() for match in LIBJPEG.finditer(said))
     padding = re.fullmatch(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9", complaints)
-    # Bytes before a JPEG's end marker that are no damage: webcams pad their images
+    # 16: bytes before a JPEG's end marker that are no damage, since webcams pad their images.
     return image, "" if padding and int(padding[1]) <= 16 else complaints
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
-    # Netpbm's text may end with its last number, OpenCV wants something behind it.
+    # Netpbm's text may end with its last number, after which OpenCV needs white space.
     data = data + b"\n" if data[:2] in (b"P2", b"P3") else data
     try:
-        # Unchanged: 16 bits stay 16, and no orientation tag turns the image away from its calibration.
+        # Unchanged: 16 bits stay 16, and orientation tags are ignored, since the calibration is of the stored image.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
-    # But OpenCV turns a TIFF by its tag whatever it is asked for.
+    # OpenCV turns a TIFF by its tag nevertheless.
     if image is not None and data.startswith(TIFF):
         return _turned_back(image, orientation(opened(BytesIO(data))))
     return image
 
 
 def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:
-    """The image as it is stored, of one that was turned by the tag of its orientation."""
+    """The image as stored, from one that was turned by its orientation tag."""
     if tag in (6, 8):
         return np.rot90(image, 1 if tag == 6 else -1)
     if tag in (5, 7):
@@ -139,22 +138,22 @@ def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
 def decode_colour(
     data: bytes, name: str, wanted: Header | None = None, levels: Levels | None = None
 ) -> tuple[Grey, NDArray[np.uint8] | None]:
-    """Grey image of an encoded file, and its colours where it has any.
+    """Grey image of an encoded file, and its colours if it has any.
 
     Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
-    ignored (the calibration holds for the pixels as they are stored).
+    ignored (the calibration is of the stored pixels).
 
     Parameters
     ----------
     data : the file's bytes.
-    name : what to call it in an error.
-    wanted : width, height and bits that it must have; the header is compared before anything is unpacked.
-    levels : how its samples are spread, of a sequence whose 16-bit images use a small part of their range.
+    name : for errors.
+    wanted : required width, height and bits; the header is compared before anything is unpacked.
+    levels : by which samples are spread, for sequences whose 16-bit images use a small part of their range.
 
     Returns
     -------
     grey : (row, col), uint8 or uint16 as stored.
-    colour : (row, col, 3) uint8 red, green, blue; None where the file is grey, or all of its pixels are.
+    colour : (row, col, 3) uint8 red, green, blue; None if the file, or all of its pixels, are grey.
 
     Raises
     ------
@@ -178,7 +177,7 @@ def decode_colour(
     colour: NDArray[np.uint8] | None = None
     if image.ndim == 3 and image.shape[2] >= 3:
         three = np.ascontiguousarray(image[:, :, :3])
-        # Many grey cameras save three equal bands: those are no colours, and cost no artifact three times the size.
+        # Many grey cameras save three equal bands, which are no colours.
         if (three != three[:, :, :1]).any():
             eight = three if three.dtype == np.uint8 else (three >> 8).astype(np.uint8)
             colour = np.ascontiguousarray(eight[:, :, ::-1])
@@ -187,13 +186,13 @@ def decode_colour(
         image = image[:, :, 0]
     grey: Grey = np.ascontiguousarray(image)
     if wanted is not None:
-        # What was decoded counts: a header may say anything.
+        # The decoded image too, since a header may be wrong.
         check_size(Header(grey.shape[1], grey.shape[0], grey.dtype.itemsize * 8), wanted, name)
     return grey, colour
 
 
 def usable(header: Header | None, name: str) -> Header:
-    """A header of an image that may be decoded."""
+    """The header, if its image may be decoded; else an error."""
     if header is None:
         kind = kind_of(name)
         text = f"{name} cannot be read as an image"
@@ -215,12 +214,12 @@ def read_grey(path: Path) -> Grey:
 
 
 def refuse_swapped(images: Sequence[AnyArray], name: str) -> None:
-    """Refuse grey images, called ``name``, the bytes of whose samples of 16 bits are exchanged in all of them.
+    """Refuse grey images, called ``name``, if the bytes of 16-bit samples are exchanged in all of them.
 
     Raises
     ------
     InputError
-        They are.
+        They are exchanged.
     """
     if images and all(map(swapped, images)):
         text = f"the samples of 16 bits of {name} have their bytes in the wrong order"
@@ -228,19 +227,19 @@ def refuse_swapped(images: Sequence[AnyArray], name: str) -> None:
 
 
 class Common(NamedTuple):
-    """Header of most images of a camera, and of each of the others why it cannot be used beside them."""
+    """Header of most images of a camera, and for each other image why it cannot be used."""
 
     header: Header
     refused: dict[Path, str]
 
 
 def common_header(paths: Sequence[Path]) -> Common:
-    """Width, height and bits a sample of most images, and which images have others or cannot be read.
+    """Width, height and bits per sample of most images, and the images that have others or cannot be read.
 
     Raises
     ------
     InputError
-        None of them can be read, or not most of these are of one size and depth, or of one that is ever decoded.
+        No image can be read, or most of them do not share one size and depth, or these are not supported.
     """
     headers, refused = dict[Path, Header](), dict[Path, InputError]()
     for path in paths:
@@ -264,7 +263,7 @@ def _header(path: Path) -> Header:
     Raises
     ------
     InputError
-        It cannot be read, or the file breaks off.
+        It cannot be read, or is truncated.
     """
     with open_regular(path, "image", MOST_BYTES) as file:
         start, header = file.peek(2)[:2], read_header(file)
@@ -274,20 +273,20 @@ def _header(path: Path) -> Header:
         bands = {b"P5": 1, b"P6": 3, b"BM": 1}.get(start, 0)  # at least, of samples that are not packed
         if header is not None and size >= bands * math.prod(header) // 8 and ENDS.get(start, b"") in file.read():
             return header
-    image = read_grey(path)  # says what is wrong
+    image = read_grey(path)  # raises the error
     return Header(image.shape[1], image.shape[0], 8 * image.itemsize)
 
 
 class Digests:
-    """SHA-256 of files, remembered by path, and by inode, size and times.
+    """SHA-256 of files, remembered by path, inode, size and times.
 
-    Where a file for it is given, each new digest is appended there as a line, the digest first and the path last: it is
-    only a memo, so that a line that does not parse is passed over, and one that cannot be written is left out.
+    With a ``memory`` file each new digest is appended there as a line, the digest first and the path last. It is only a
+    memo: lines that do not parse are skipped, and errors of writing ignored.
 
     Attributes
     ----------
-    growing : whether images are still arriving: those without a partner are left out, and so are rows of tables for
-        more.
+    growing : whether images are still arriving: those without a partner, and rows of tables for later images, are left
+        out.
     """
 
     growing = False
@@ -295,14 +294,14 @@ class Digests:
     def __init__(self, memory: Path | None = None) -> None:
         self._memory = memory
         self._known: dict[str, str] = {}
-        with suppress(OSError):  # that of a shared cache may be its owner's alone
+        with suppress(OSError):  # in a shared cache it may be private to its owner
             if memory is not None and memory.is_file():
                 lines = memory.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
                 parts = (line.partition(" ") for line in lines)
                 self._known = {key: digest for digest, _, key in parts if len(digest) == 64}
 
     def whole(self, path: Path) -> bool:
-        """Whether an image file may be taken; one that somebody still writes may not."""
+        """Whether an image file is complete, and not still being written."""
         return True
 
     def sha256(self, path: Path) -> str:
@@ -316,7 +315,7 @@ class Digests:
             with open_regular(path, "image", MOST_BYTES) as file:
                 self._known[key] = hashlib.file_digest(file, "sha256").hexdigest()
             if self._memory is not None:
-                # Appended, not rewritten: two runs at once both keep what they found, and a torn line is passed over.
+                # Appended, not rewritten: two runs at once both keep their digests, and a torn line is skipped.
                 with suppress(OSError):
                     self._memory.parent.mkdir(parents=True, exist_ok=True)
                     with self._memory.open("a", encoding="utf-8", errors="surrogateescape") as memory:
@@ -325,7 +324,7 @@ class Digests:
 
 
 def image_source(path: Path, frame: int, camera: str, header: Header, digests: Digests) -> Source:
-    """Source of one file; ``header`` is what it must have."""
+    """Source of one file with the required ``header``."""
     args = {"sha256": digests.sha256(path), "camera": camera, "frame": frame, "header": header._asdict()}
     return Source("rille.datasets.images.files", NoParams(), args, hints={"path": str(path.resolve())})
 
@@ -336,7 +335,7 @@ def read_unchanged(path: Path, sha256: str, name: str) -> bytes:
     Raises
     ------
     InputError
-        It cannot be read, or its digest is another by now: it must not be stored under the key of the former content.
+        It cannot be read, or its digest has changed, so that it must not be stored under the key of the former content.
     """
     data = read_bytes(path, "image", MOST_BYTES)
     if hashlib.sha256(data).hexdigest() != sha256:
@@ -379,25 +378,25 @@ def image_stage(
     """One image file, checked and grey."""
     data = read_unchanged(Path(path), sha256, f"frame {frame}, {camera} image {path}")
     try:
-        # Without the path, which is no part of the task's key.
+        # Without the path, which is not in the task's key.
         image, colour = decode_colour(data, f"{camera} image", header, levels)
     except InputError as error:
         return empty(frame, camera, header, error)
     meta: ImageFacts = {"frame": frame, "camera": camera}
     arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
-    # The right image's colours would colour nothing: an ortho image is made of left ones.
+    # Colours of left images alone, since ortho images are made of these.
     return Bundle(arrays if colour is None or camera != "left" else arrays | {"colour": colour}, meta)
 
 
 def empty(frame: int, camera: str, header: Header, damage: InputError) -> Bundle[ImageFacts]:
-    """An image without a usable pixel in the place of one that is ``damage``: this costs the frame, not the run."""
+    """An image without a usable pixel instead of a damaged one, so that the frame is lost, not the run."""
     nothing = np.zeros((header.height, header.width), np.uint16 if header.depth > 8 else np.uint8)
     meta: ImageFacts = {"frame": frame, "camera": camera, "damage": damage.message}
     return Bundle({"image": nothing, "valid": nothing.astype(np.uint8)}, meta)
 
 
 def sound(image: Bundle, path: str = "") -> Bundle:
-    """The image, which is of the file ``path``, for those who need this very one.
+    """The image of the file ``path``, unless it stands for a damaged one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Kinds of files that Rille does not read, by their endings: what they are, and how to convert them."""
+"""Kinds of files that Rille does not read, by their endings, and how to convert them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ KINDS: dict[str, tuple[str, str]] = {
     "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst", "unpack it"),
     "file": ("", "neither images nor a calibration or table that is known"),
 }
-"""Endings and next step by the name of a kind; the kind ``file`` is any other."""
+"""Endings and remedy by the name of a kind; the kind ``file`` is any other."""
 
 
 def kind_of(name: str) -> str:
@@ -51,12 +51,12 @@ def kind_of(name: str) -> str:
 
 
 def hints(name: str) -> list[str]:
-    """What to do with a file whose ending tells its kind: one line, or none."""
+    """Remedy for a file of a known kind: one line, or none."""
     return unread([name] if kind_of(name) != "file" else [])
 
 
 def unread(names: Iterable[str]) -> list[str]:
-    """A line for each kind of file that is not read: their number, the first one, what to do."""
+    """A line for each kind of file that is not read: their number, the first one, the remedy."""
     groups: dict[str, list[str]] = defaultdict(list)
     for name in names:
         groups[kind_of(name)].append(name)

@@ -1,7 +1,7 @@
-"""A mask of a camera: which of its pixels never show the scene, such as the vehicle's own body.
+"""Masks of a camera's pixels that never show the scene, such as the vehicle's own body.
 
-A mask is an image of the camera's size as it takes them, before any lens distortion is removed. Its bright pixels are
-used, its dark ones are not: everything from matching to the map sees an image without them.
+A mask has the size of the camera's images, before any lens distortion is removed. Its bright pixels are used, its dark
+ones are not, from matching to the map.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from rille.stages.core.errors import InputError
 
 
 def usable(mask: AnyArray) -> Bools:
-    """Pixels (row, col) that a mask leaves: those brighter than half of its greatest value, whatever its scale."""
+    """Usable pixels (row, col) of a mask: those brighter than half of its greatest value, whatever its scale."""
     return np.asarray(mask.astype(np.float32) > 0.5 * float(mask.max()))
 
 
 def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
-    """The sequence without the pixels that the masks of its cameras leave out.
+    """The sequence without the masked pixels of its cameras.
 
     Raises
     ------
     InputError
-        A mask cannot be read, has not the size of the camera's images, or leaves next to nothing.
+        A mask cannot be read, does not have the size of the camera's images, or leaves hardly any pixel.
     """
     if not sequence.masks:
         return sequence
@@ -44,7 +44,7 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
         if keep.shape != (camera.height, camera.width):
             text = f"{place} is {keep.shape[1]} x {keep.shape[0]} pixels, the images {camera.width} x {camera.height}"
             raise InputError("RIL-904", text, remedy="draw the mask on an image as the camera gave it")
-        # Of the pixels that must stay: with fewer there is nothing to match
+        # 0.05: least share of usable pixels; fewer cannot be matched.
         if keep.mean() < 0.05:
             text = f"{place} leaves {100 * keep.mean():.1f} % of the image"
             raise InputError("RIL-905", text, remedy="make bright what is to be used, and dark what is not")

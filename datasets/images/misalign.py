@@ -1,7 +1,7 @@
 """Any sequence as if its right camera had been knocked, to try the effect of a wrong calibration.
 
-The right images are warped as the turned camera would have taken them, while the rig that is *given* stays. So the turn
-is what stage ``rig`` should find (its corrections pitch, yaw, roll have these signs), and truth stays true.
+The right images are warped as if taken by the turned camera, while the *given* rig stays. So stage ``rig`` should find
+the turn (its corrections pitch, yaw, roll have these signs), and truth remains true.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class MisalignParams(Params):
         return not any((self.rows, self.roll_deg, self.pitch_deg, self.yaw_deg))
 
     def words(self) -> str:
-        """What is done to the right images."""
+        """Change of the right images, in words."""
         return (
             f"right images are misaligned on purpose: {self.rows:g} px in the row, {self.roll_deg:g} degrees of roll, "
             f"{self.pitch_deg:g} of pitch, {self.yaw_deg:g} of yaw; the given rig does not say so"
@@ -54,14 +54,12 @@ class MisalignParams(Params):
 
 
 def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
-    """The sequence with its right images warped; the same object where nothing is to be changed.
-
-    It has no exact disparity any more.
+    """The sequence with its right images warped, without exact disparity; the same object if nothing is to be changed.
 
     Raises
     ------
     InputError
-        Another program's disparities of it are given, which are of other images then.
+        The sequence has disparities of another program, which do not fit the warped images.
     """
     if params.none:
         return sequence
@@ -87,7 +85,7 @@ def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
 
 
 def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:
-    """Column and row (height, width) of the original image that each pixel of the knocked one shows; NaN: none."""
+    """Column and row (height, width) in the original image of each pixel of the knocked one; NaN: outside."""
     camera = lens.camera
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height) - params.rows)
     pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
@@ -103,8 +101,8 @@ def origins(lens: Lens, params: MisalignParams) -> tuple[Floats, Floats]:
 def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -> tuple[AnyArray, AnyArray]:
     """Knocked image and its mask, (row, col), of the types of the original ones.
 
-    Cubic splines (SciPy's, not OpenCV's remap, which rounds positions to a 32nd of a pixel). A pixel is valid where
-    all that the kernel reads is.
+    Cubic splines (SciPy's, not OpenCV's remap, which rounds positions to a 32nd of a pixel). A pixel is valid if all
+    pixels that the kernel reads are.
     """
     column, row = origins(lens, params)
     there = np.isfinite(column) & np.isfinite(row)
@@ -112,8 +110,7 @@ def warp(image: AnyArray, valid: AnyArray, lens: Lens, params: MisalignParams) -
     values = scipy.ndimage.map_coordinates(image.astype(np.float64), at, order=3, mode="nearest")
     top = np.iinfo(image.dtype).max if np.issubdtype(image.dtype, np.integer) else np.inf
     values = np.clip(np.rint(values) if np.isfinite(top) else values, 0, top)
-    # A cubic spline reads 4 x 4 pixels: one that is not usable spoils all places that read it.
-    # 4: pixels along either side that cubic interpolation reads.
+    # 4: pixels along either side that cubic interpolation reads; all must be usable.
     kernel = np.ones((4, 4), np.uint8)
     whole = cv2.erode(
         (valid != 0).astype(np.uint8), kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0

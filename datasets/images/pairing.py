@@ -1,4 +1,4 @@
-"""Which left image belongs to which right one: by name, number, time stamp or order; and the tokens of sides."""
+"""Pair left and right images: by name, number, time stamp or order; and the tokens of sides."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rille.datasets.text.warning import warning
 from rille.stages.core.errors import IncompleteError, InputError
 
 STAMP = re.compile(r"(?<!\d)[1-9]\d{9}(?:[_-]\d{9}|\d*(?:\.\d+)?)(?!\d)")
-"""Seconds since 1970 have ten digits, their fractions more; frame numbers have fewer, or zeros in front."""
+"""Seconds since 1970 have ten digits, with fractions more; frame numbers have fewer, or leading zeros."""
 
 SHARE, MOST_APART = 0.25, 0.01
-"""Share of the usual interval, and seconds, that the images of a pair are apart at most: at 10 m/s, 0.1 m."""
+"""Largest time between the images of a pair: share of the usual interval, and seconds (0.1 m at 10 m/s)."""
 
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
@@ -48,14 +48,14 @@ class ImagePair:
 
 
 class TimedPairs(NamedTuple):
-    """Images of two cameras that were taken together.
+    """Simultaneous images of two cameras.
 
     Attributes
     ----------
-    places : of the left and of the right image of each pair, in order of time.
-    alone : images that have no partner.
-    apart : s; the longest time between the images of a pair; between the nearest ones where there is no pair.
-    allowed : s; how long it may be.
+    places : indices of the left and of the right image of each pair, in order of time.
+    alone : number of images without a partner.
+    apart : s; longest time between the images of a pair; between the nearest ones if there is no pair.
+    allowed : s; its limit.
     """
 
     places: list[tuple[int, int]]
@@ -64,14 +64,14 @@ class TimedPairs(NamedTuple):
     allowed: float
 
     def lines(self, code: str) -> list[str]:
-        """A warning where images have no partner, or those of a pair are not of one time."""
+        """A warning if images have no partner, or those of a pair are not simultaneous."""
         text = f"images of a pair are up to {1e3 * self.apart:.3g} ms apart ({1e3 * self.allowed:.3g} ms are allowed)"
         alone = f"; {count(self.alone, 'image')} without a partner of the same time are left out" if self.alone else ""
         return [warning(code, text + alone)] if self.apart or alone else []
 
 
 def join(left: Sequence[float], right: Sequence[float], tolerance: float | None = None) -> TimedPairs:
-    """Join the images of two cameras, each to the nearest of the other one in time.
+    """Pair images of two cameras that are nearest to each other in time.
 
     Parameters
     ----------
@@ -83,20 +83,20 @@ def join(left: Sequence[float], right: Sequence[float], tolerance: float | None 
     allowed = tolerance or min([MOST_APART, *(SHARE * interval for interval in intervals)])
     ours, theirs = (np.searchsorted((t[1:] + t[:-1]) / 2, s) for t, s in ((b, a), (a, b)))
     apart = np.abs(a - b[ours])
-    # Each must be the other's nearest, else one image would stand in two pairs.
+    # Each must be the other's nearest, else one image would be in two pairs.
     there = np.flatnonzero((theirs[ours] == np.arange(len(a))) & (apart <= allowed))
     longest = float(max(apart[there], default=apart.min()))
     return TimedPairs([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
 
 
 def stamp_of(name: str) -> str:
-    """The time since 1970 in a file's name, in whatever unit; empty where there is none."""
+    """The time since 1970 in a file's name, in any unit; empty if there is none."""
     found = STAMP.search(name)
     return re.sub("[_-]", ".", found[0]) if found else ""
 
 
 def _times(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Times in the names of sorted files, s; none where not each has its own."""
+    """Times in the names of sorted files, s; empty unless each has its own."""
     stamps = [stamp for path in paths if (stamp := stamp_of(path.stem))]
     with suppress(InputError):
         return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
@@ -111,12 +111,12 @@ UNWRITABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def writable(name: str) -> None:
-    """Refuse the name of a file that no line of text can hold.
+    """Refuse the name of a file that does not fit into a line of text.
 
     Raises
     ------
     InputError
-        It has a line break, or is not in UTF-8.
+        It has a control character or a line break, or is not in UTF-8.
     """
     if UNWRITABLE.search(name):
         text = f"the name {name!r} has a line break, or is not in UTF-8: no manifest holds it"
@@ -124,7 +124,7 @@ def writable(name: str) -> None:
 
 
 COUNTER = re.compile(r"(\d{3,})\D*$")
-"""The last number of a name, of a width that is filled with zeros."""
+"""The last number of a name, of three digits or more."""
 
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
@@ -133,18 +133,18 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
 
 
 def in_order(stems: Sequence[str]) -> list[str]:
-    """Names without their side from the first one taken to the last: see :func:`_ascending`, :func:`_begun_anew`."""
+    """Names without their side in order of time: see :func:`_ascending`, :func:`_begun_anew`."""
     ordered = _ascending(stems)
     first = _begun_anew(ordered)
     return ordered[first:] + ordered[:first]
 
 
 def _ascending(stems: Sequence[str]) -> list[str]:
-    """Names without their side by the time stamps in them, by the decimals that they are, or in natural order."""
+    """Names without their side, ordered by time stamps or decimal numbers in them, else in natural order."""
     found = [DECIMAL.fullmatch(stem) for stem in stems]
     numbers = [match[2] for match in found if match]
     fractions = [number.partition(".")[2] for number in numbers]
-    # A fraction that ends in 0, among others of unlike length, is a number of its own: 1.9 before 1.10.
+    # Fractions of unlike length with a final 0 are numbers of their own: 1.9 before 1.10.
     counts = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in stems]
@@ -153,9 +153,8 @@ def _ascending(stems: Sequence[str]) -> list[str]:
 
 
 def _begun_anew(ordered: Sequence[str]) -> int:
-    """Place of the first of some names in order, before which a counter reached its last number (999) and went on from
-    0, or from 1 as cameras count (DCF); 0: none did, as far as one can tell: more numbers are left out than there
-    are."""
+    """Index, in ordered names, of the image taken first, if a counter has reached its last number (999) and gone on
+    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; else 0."""
     digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
     if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
         return 0
@@ -167,12 +166,12 @@ def _begun_anew(ordered: Sequence[str]) -> int:
 
 
 def ends(paths: Sequence[Path]) -> str:
-    """``000000.png to 000050.png``: the names of the first and the last of some files."""
+    """The names of the first and the last of some files: ``000000.png to 000050.png``."""
     return " to ".join(dict.fromkeys((paths[0].name, paths[-1].name))) if paths else "none"
 
 
 def _token(word: str) -> re.Pattern[str]:
-    """A side's token, which must not be part of a longer word; capitals begin one: ``imgL``, ``leftImg``."""
+    """Pattern of a side's token, not within a longer word; capitals begin a word: ``imgL``, ``leftImg``."""
     digits = r"(?!\d)" if word[-1].isdigit() else ""
     small, capitals = rf"(?<![A-Za-z]){word}(?![a-z])", rf"(?<![A-Z]){word.upper()}(?![A-Za-z])"
     return re.compile(rf"({small}|(?<![A-Z]){word.capitalize()}(?![a-z])|{capitals}){digits}")
@@ -182,7 +181,7 @@ TOKENS = tuple(tuple(_token(word) for word in sides) for sides in SIDES)
 
 
 def side_of(name: str) -> tuple[int, int, str] | None:
-    """Which token a name has: (row of ``SIDES``, 0 left or 1 right, name with the token taken out), or None."""
+    """The token of a name: (row of ``SIDES``, 0 left or 1 right, name without the token), or None."""
     for row, patterns in enumerate(TOKENS):
         for side, pattern in enumerate(patterns):
             neutral, count = pattern.subn("*", name)
@@ -192,7 +191,7 @@ def side_of(name: str) -> tuple[int, int, str] | None:
 
 
 def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Left and right of the names that differ in the side's token alone."""
+    """Left and right names that differ in the side's token alone."""
     sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
     for name in names:
         at = side_of(name)
@@ -202,9 +201,9 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
-    """Places of the names by the one word, of two, that parts them into pairs which are alike but for it (A/07, B/07).
+    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07.
 
-    In natural order of the words; nothing where no word does so, or more than one.
+    In natural order of the words; empty unless exactly one position of words does so.
     """
     found = []
     words = [re.split(r"([^\W_]+)", name) for name in names]
@@ -241,11 +240,11 @@ def pair_up(
     rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which all differ),
         ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest
         where time stamps differ, and number where the names of the two cameras have nothing in common.
-    gaps : images that are paired by name and have no partner make a pair of which a file is absent, as long as they
-        are fewer than the whole pairs.
-    growing : images behind the last pair, by name or number, are left out: their partners are still to come.
-    tolerance : s; how far the stamps of a pair may be apart; None: see :func:`join`.
-    warnings : takes lines on what is left out or apart.
+    gaps : images that are paired by name and have no partner make a pair with an absent file, as long as they are
+        fewer than the whole pairs.
+    growing : images after the last pair, by name or number, are left out, since their partners are still to come.
+    tolerance : s; largest difference of the stamps of a pair; None: see :func:`join`.
+    warnings : takes lines on images that are left out or not simultaneous.
 
     Raises
     ------
@@ -260,7 +259,7 @@ def pair_up(
     times = _times(left), _times(right)
     joined = join(*times, tolerance) if all(times) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
-    # One image each is a pair, whatever the two are called.
+    # One image each is a pair, whatever their names.
     if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
         if len(left) != len(right):
             remedy = "remove what is too many, or pair by name or number"
@@ -300,10 +299,10 @@ def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
 
 
 def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
-    """Images by what those of a pair share: their name without the side's token, or its number."""
+    """Images by the key of a pair: the name without the side's token, or its number."""
     by_key: dict[str, Path] = {}
     found = [re.findall(r"\d+", path.stem)[::-1] for path in paths]
-    # The last number that no two names share; behind it may stand that of a camera, or of a file's version.
+    # The last number that no two names share; a later one may be that of the camera, or of a file's version.
     last = next((k for k, of in enumerate(zip(*found, strict=False)) if len(set(of)) == len(paths)), 0)
     for path, numbers in zip(paths, found, strict=True):
         if rule == "number" and not numbers:
@@ -319,7 +318,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
 
 
 def _up_to_last_pair(left: dict[str, Path], right: dict[str, Path]) -> tuple[dict[str, Path], dict[str, Path]]:
-    """The images whose key is not behind that of the last pair; all of them where there is no pair."""
+    """The images whose key is not after that of the last pair; all images if there is no pair."""
     last = max((natural(key) for key in left if key in right), default=None)
     if last is None:
         return left, right
@@ -330,7 +329,7 @@ def _up_to_last_pair(left: dict[str, Path], right: dict[str, Path]) -> tuple[dic
 def _two_clocks(
     pairs: Sequence[ImagePair], left: Sequence[float], right: Sequence[float], most: float | None
 ) -> list[str]:
-    """A line where the stamps of all pairs by order differ by a constant, as those of two clocks do.
+    """A warning if the stamps of all pairs by order differ by a constant, as those of two clocks.
 
     Raises
     ------
@@ -338,7 +337,7 @@ def _two_clocks(
         The stamps put the images of a pair farther apart: by ``most`` s, or by half the usual interval.
     """
     apart, most = np.subtract(right, left), most or float(np.median(np.diff(left))) / 2
-    # Where images have partners as they are, there is one clock, and a constant is that of lost images.
+    # If images have simultaneous partners, there is one clock, and a constant is due to lost images.
     offset = float(np.median(apart)) if len(join(left, right).places) < 2 else 0.0
     k = int(np.argmax(np.abs(apart - offset)))
     if abs(apart[k] - offset) > most:
@@ -353,7 +352,7 @@ def _two_clocks(
 
 
 def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]]) -> tuple[ImagePair, ...]:
-    """Pairs of all keys and of numbers left out of a running count; an absent file has the name that it would have."""
+    """Pairs of all keys and of missing numbers of a running count; an absent file has its expected name."""
     whole = next(key for key in by_key[0] if key in by_key[1])
     keys = counted(in_order(list({**by_key[0], **by_key[1]})))
     paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
@@ -366,7 +365,7 @@ def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]]) -> tuple[ImagePa
 
 
 def counted(names: list[str]) -> list[str]:
-    """Names with the numbers that a running count leaves out; as they are where most do not count on by one."""
+    """Names with the missing numbers of a running count; unchanged unless most numbers increase by one."""
     if len(names) < 3 or not all(name.isdecimal() for name in names):
         return names
     numbers = [int(name) for name in names]
@@ -384,7 +383,7 @@ def _called(example: Path, key: str, wanted: str) -> Path:
 
 
 def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
-    """Name each pair by what its files share; by the left file where that would not be unique."""
+    """Name each pair by the common part of its files' names; by the left file if that is not unique."""
     names = [without_side(path.stem, 0).replace("*", "").strip("_-. ") for path, _ in pairs]
     if len(set(names)) < len(names) or not all(names):
         names = [path.stem for path, _ in pairs]
@@ -396,7 +395,7 @@ def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:
 def common_headers(pairs: Sequence[ImagePair]) -> tuple[Headers, tuple[ImagePair, ...]]:
     """Width, height and bits of most images of each side (see :func:`rille.datasets.images.files.common_header`).
 
-    And the pairs; of those with an image that has others, or cannot be read, ``absent`` says so.
+    And the pairs, with ``absent`` for those with an image that has others, or cannot be read.
     """
     whole = [pair for pair in pairs if not pair.absent]
     left = files.common_header([pair.left for pair in whole])

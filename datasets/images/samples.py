@@ -1,4 +1,4 @@
-"""Some images of a sequence, looked at when it is opened: range of samples, mosaics, fields, orientations."""
+"""Checks of some images when a sequence is opened: range of samples, mosaics, fields, orientations."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from rille.stages.core.errors import InputError, RilleError
 from rille.stages.imaging import levels
 
 FORMATS = ("JPEG", "TIFF", "PNG")
-"""Pillow's names of formats that have tags, and may hold several images."""
+"""Pillow's names of formats with tags, or with several images in a file."""
 
 BLOCK = 16
-"""Cells of 2 x 2 pixels along a side of a block whose four phases are compared."""
+"""Side of a block, in cells of 2 x 2 pixels, whose four phases are compared."""
 
 
 def examined(sequence: Sequence) -> Sequence:
-    """The sequence with warnings of what some of its images show, and with the levels that its 16-bit images need.
+    """The sequence with warnings about some of its images, and with levels for 16-bit images.
 
     Raises
     ------
@@ -37,12 +37,12 @@ def examined(sequence: Sequence) -> Sequence:
         images a file.
     """
     there = [k for k in range(sequence.frames) if k not in sequence.lost]
-    # Frames, spread over the sequence; `rille check` looks at all
+    # 3 frames, spread over the sequence; `rille check` opens all.
     chosen = there[:: max(1, -(-len(there) // 3))]
     sources = {camera: [sequence.image(k, camera) for k in chosen] for camera in CAMERAS}
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
     for source in [of[0] for camera, of in sources.items() if of and not images[camera] and "path" in of[0].hints]:
-        files.read_grey(Path(source.hints["path"]))  # says what is wrong
+        files.read_grey(Path(source.hints["path"]))  # raises the error
     orientations: dict[str, set[int]] = {camera: set() for camera in CAMERAS}
     for camera, source in ((camera, source) for camera, of in sources.items() for source in of):
         turned, several = _tags(source)
@@ -61,7 +61,7 @@ def examined(sequence: Sequence) -> Sequence:
         text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
         lines.append(warning("RIL-832", text))
     for camera, share in [(camera, fixed_pattern(of)) for camera, of in images.items() if camera not in mosaics]:
-        # 0.2: in images of scenes that move at most 0.03, by a pattern of 8 grey levels in 256 0.25, of 25 0.7.
+        # 0.2: moving scenes have at most 0.03, with a pattern of 8 grey levels in 256 0.25, of 25 levels 0.7.
         if share > 0.2:
             text = (
                 f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract "
@@ -83,7 +83,7 @@ def examined(sequence: Sequence) -> Sequence:
 
 
 def _images(source: Source) -> list[AnyArray]:
-    """The grey image (row, col); none of one that cannot be read, which its own task says."""
+    """The grey image (row, col); empty if it cannot be read, which its task reports."""
     with suppress(RilleError):
         stage = declared(import_module(source.module))
         assert stage is not None
@@ -92,17 +92,17 @@ def _images(source: Source) -> list[AnyArray]:
 
 
 def _tags(source: Source) -> tuple[int, bool]:
-    """EXIF's orientation of an image file, 1 where it cannot be read; whether it has a second image that is no mask or
-    smaller copy of the first."""
+    """EXIF's orientation of an image file, 1 if it cannot be read; whether the file has a second image that is no mask
+    or smaller copy of the first."""
     turned, several = 1, False
     with (
         catch_warnings(action="ignore"),
-        suppress(Exception),  # of a damaged directory: whatever the parsers come upon; there is no second image
+        suppress(Exception),  # parsers of a damaged directory raise anything, and the end of the file if one is alone
         Image.open(source.hints["path"], formats=FORMATS) as image,
     ):
         turned, size = orientation(image), image.size
         image.seek(1)
-        # TIFF's tag of an image that is a smaller copy (1) or a mask (4) of another one; pages of a stack have 2
+        # 254: TIFF's tag of a smaller copy (1) or a mask (4) of another image; pages of a stack have 2.
         several = image.size == size and not getattr(image, "tag_v2", {}).get(254, 0) & (1 | 4)
     return turned, several
 
@@ -110,8 +110,8 @@ def _tags(source: Source) -> tuple[int, bool]:
 def mosaic(image: AnyArray) -> bool:
     """Whether a grey image (row, col) shows the colour filters of single pixels.
 
-    In each block of cells of 2 x 2 pixels the means of the four phases differ, where in an ordinary image they agree.
-    Rows or columns that differ by turns, as of two fields or two amplifiers, are no mosaic.
+    In each block of cells of 2 x 2 pixels the means of the four phases differ, while in an ordinary image they agree.
+    Alternating rows or columns, as of two fields or two amplifiers, are no mosaic.
     """
     rows, cols = (n // (2 * BLOCK) for n in image.shape)
     if rows * cols < 12:
@@ -121,7 +121,7 @@ def mosaic(image: AnyArray) -> bool:
     a, b, c, d = cells
 
     def differ(halves: AnyArray) -> AnyArray:
-        """Whether two halves of a cell do: by a share of the grey value, and by standard deviations."""
+        """Whether two halves of a cell differ: by a share of the grey value, and by standard deviations."""
         departs = np.abs(halves.mean(-1)) / 2
         return np.asarray((departs > 0.03 * cells.mean((0, 3))) & (departs > 3.0 * halves.std(-1) / BLOCK))
 
@@ -131,11 +131,11 @@ def mosaic(image: AnyArray) -> bool:
 
 
 def interlaced(image: AnyArray) -> bool:
-    """Whether every other row of a grey image (row, col) fits the row between less than the next but one, as where two
-    fields show something that moved; columns of a scene, and both in a mosaic, tell it from that."""
+    """Whether rows of a grey image (row, col) are more like those two rows apart than like their neighbours, as with
+    two fields of a moving scene, but columns are not, as in a mosaic."""
 
     def ratio(rows: AnyArray) -> float:
-        """Differences of rows two apart over those of neighbours, 1.2 to 2 in ordinary images, 1 in mere noise."""
+        """Differences of rows two apart over those of neighbours: 1.2 to 2 in ordinary images, 1 in noise alone."""
         return float(np.abs(rows[2:] - rows[:-2]).mean() / max(np.abs(rows[1:] - rows[:-1]).mean(), 1e-6))
 
     grey = image.astype(np.float32)
@@ -143,17 +143,17 @@ def interlaced(image: AnyArray) -> bool:
 
 
 def fixed_pattern(images: list[AnyArray]) -> float:
-    """Share of the finest detail that keeps its place in some images (row, col) of a camera, in the median block.
+    """Share of the finest detail that stays in place in some images (row, col) of a camera, in the median block.
 
-    0 where coarser detail does so as well, as before a camera that stands: that without single pixels, for hot ones are
-    bright enough to outweigh a dark scene in the means of their surroundings.
-    The mean of n images keeps one n-th of the variance of a scene that moves, and all of a fixed pattern's.
+    0 if coarser detail does too, as with a camera at rest. Coarser detail is measured without single pixels, since hot
+    ones would outweigh a dark scene in the means of their surroundings.
+    The mean of n images keeps one n-th of the variance of a moving scene, and all of a fixed pattern's.
     """
     if len(images) < 3 or len({image.shape for image in images}) > 1 or min(images[0].shape) < 4 * BLOCK:
         return 0.0
 
     def kept(factor: int) -> float:
-        """The share in images made smaller by a factor."""
+        """The share in images reduced by a factor."""
         size = images[0].shape[1] // factor, images[0].shape[0] // factor
         taken = [image.astype(np.float32) for image in images]
         taken = taken if factor == 1 else [cv2.medianBlur(image, 3) for image in taken]
@@ -171,7 +171,7 @@ def fixed_pattern(images: list[AnyArray]) -> float:
 
 
 def _orientations(left: set[int], right: set[int]) -> list[str]:
-    """A line where all images are turned alike: they are taken as they are stored."""
+    """A line if all images have one orientation tag, which is ignored."""
     if left | right <= {1}:
         return []
     words = f"EXIF orientations are {sorted(left)} of left images and {sorted(right)} of right ones"

@@ -1,1 +1,1 @@
-"""A sequence described by a file of the user's: ``NAME.rille.toml``."""
+"""A sequence described by the user's file ``NAME.rille.toml``."""

@@ -1,4 +1,4 @@
-"""What a manifest knows of time and movement: time stamps, true poses, odometry, attitude and vertical of each pair."""
+"""Times and motion of a manifest: time stamps, true poses, odometry, attitude and vertical of each pair."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ Poses = tuple[RigidTransform | None, ...]
 Row = TypeVar("Row")
 
 TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
-"""Seconds since 1970 and nanoseconds; where the second is a number of frames, a time changes by nothing that counts."""
+"""Seconds since 1970 and nanoseconds; if the second is the number of a frame, it hardly changes the time."""
 
 TIME = re.compile("time|stamp", re.IGNORECASE)
-"""In the title of a column of times."""
+"""Part of the title of a column of times."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 NUMBERS_AS_TIMES = 'names = true with unit = "s" takes those in the names of the images for seconds'
@@ -50,14 +50,14 @@ NUMBERS_AS_TIMES = 'names = true with unit = "s" takes those in the names of the
 
 @dataclass
 class MotionReader:
-    """Reads the files of motion of one manifest.
+    """Reads the times and motion of one manifest.
 
     Attributes
     ----------
     root : folder that files are relative to.
-    pairs : of images; of some a file may be absent.
-    sequence : with what has been read so far; times come first, by which the others are interpolated.
-    growing : images are still arriving, so that a table may have rows for more of them.
+    pairs : of images; some may lack a file.
+    sequence : with the records read so far; times come first, by which the others are interpolated.
+    growing : whether images are still arriving, so that a table may have rows for later ones.
     """
 
     root: Path
@@ -93,21 +93,21 @@ class MotionReader:
         return self.sequence
 
     def state(self, **found: Any) -> None:
-        """Enter something into the sequence."""
+        """Set attributes of the sequence."""
         self.sequence = replace(self.sequence, **found)
 
     def warn(self, lines: tuple[str, ...]) -> None:
-        """Enter warnings into the sequence."""
+        """Add warnings to the sequence."""
         self.state(warnings=(*self.sequence.warnings, *lines))
 
     def times(self, section: Times) -> tuple[float, ...]:
-        """Time of each pair, s; of one without a row of its own between its neighbours.
+        """Time of each pair, s; for one without a row interpolated between its neighbours.
 
         Raises
         ------
         InputError
-            The times do not parse, are not one a pair or of other images, do not increase, mix units, or are names that
-            count.
+            The times do not parse, are not one for each pair or of other images, do not increase, mix units, or are
+            frame numbers in names.
         """
         if section.rate_hz is not None:
             return tuple(k / section.rate_hz for k in range(len(self.pairs)))
@@ -121,8 +121,8 @@ class MotionReader:
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
     def stamps_of_names(self, unit: str) -> tuple[str, list[tuple[str, int]]]:
-        """The ``unit``, and the time stamp in each left image's name, a date, one since 1970 or its last number, with
-        the pair's place."""
+        """The ``unit``, and the time stamp in each left image's name (a date, one since 1970, or its last number) with
+        the pair's number."""
         stems = [undated(pair.left.stem) for pair in self.pairs]
         stamps = [stamp_of(stem) or ["", *re.findall(r"\d+(?:\.\d+)?", stem)][-1] for stem in stems]
         wrong = stamps.index("") if "" in stamps else 0
@@ -134,10 +134,9 @@ class MotionReader:
         return unit, [(stamp, k) for k, stamp in enumerate(stamps, start=1)]
 
     def stamps_of_file(self, path: Path) -> tuple[str, list[tuple[str, int] | None]]:
-        """Unit that the column's name states, or ``auto``; time stamp of each pair as text, and the line that it stands
-        in."""
+        """Unit in the column's name, or ``auto``; time stamp of each pair as text, and its line number."""
         lines = read_lines(path, "times")
-        if self.growing and not path.read_bytes().endswith(b"\n"):  # whoever writes it has not come to the line's end
+        if self.growing and not path.read_bytes().endswith(b"\n"):  # the last line is still being written
             del lines[-1:]
         header, found, at = tuple[str, ...](), list[list[str]](), list[int]()
         images, by_name = False, dict[str, int]()
@@ -161,7 +160,7 @@ class MotionReader:
         unit = next((stated for stated in units if stated in UNITS), "auto")
         column = int(_counts(found))
         rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
-        # Tables may list more images than there are pairs, in any order: names decide where all are found.
+        # Tables may list more images than there are pairs, in any order: if all pairs are found, names decide.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
             return unit, [rows[by_name[p.left.stem]] if p.left.stem in by_name else None for p in self.pairs]
@@ -174,7 +173,8 @@ class MotionReader:
         return unit, taken
 
     def one_a_pair(self, rows: Sequence[Row]) -> list[Row | None] | None:
-        """One row a pair, or, where there are rows for whole pairs alone, None for the others; None: of other pairs.
+        """One row for each pair; None for pairs that lack a file, if there are rows for whole pairs alone. None: the
+        rows are those of other pairs.
 
         Rows for images that are still to come are left out.
         """
@@ -185,7 +185,7 @@ class MotionReader:
         return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
     def poses(self, section: PoseFile | Attitude, table: str, read: TextTable | None = None) -> Poses:
-        """T_reference_left of each pair from a file of poses of a body, which may have been ``read`` before."""
+        """T_reference_left of each pair from a file of a body's poses, which may have been ``read`` before."""
         path = self.root / section.file
         rows = read or read_motion(path, section.format)
         timed = poses_of(rows, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
@@ -220,15 +220,15 @@ class MotionReader:
         return tuple(pose and pose @ T_body_left for pose in poses)
 
     def of_images(self, timed: TimedPoses) -> Poses:
-        """The pose of each left image, by its name in the file; None of one that the file does not name.
+        """The pose of each left image, by its name in the file; None for images that the file does not name.
 
         Raises
         ------
         InputError
-            It names none of them, or one twice.
+            The file names none of them, or one twice.
         """
         known = {PurePosixPath(image).parts: pose for image, pose in zip(timed.images, timed.poses, strict=True)}
-        # By as many of the path's last parts as the file states: COLMAP's names begin at its own folder of images.
+        # By the last parts of the path, as many as in the file: COLMAP's names begin at its folder of images.
         paths = [pair.left.parts for pair in self.pairs]
         stated = ([path[k:] for k in range(len(path)) if path[k:] in known] for path in paths)
         poses = tuple(known[parts[0]] if parts else None for parts in stated)
@@ -239,7 +239,7 @@ class MotionReader:
         return poses
 
     def truth(self, section: Truth) -> None:
-        """Poses of each pair, or positions alone with their own times."""
+        """Read true poses of each pair, or true positions with their own times."""
         rows = read_motion(self.root / section.file, section.format)
         alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
@@ -255,14 +255,14 @@ class MotionReader:
         self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
     def odometry(self, section: Odometry) -> None:
-        """Dead reckoning, which is a measurement where it says how good it is."""
+        """Read dead reckoning, which is a measurement if its accuracy is stated."""
         self.state(odometry=self.poses(section, "odometry"))
         if section.drift is not None and section.turn_deg is not None:
             sigmas = {"drift": section.drift, "turn": math.radians(section.turn_deg)}
             self.state(priors={**self.sequence.priors, "odometry": sigmas})
 
     def true_positions(self, section: Truth, found: TimedPositions) -> protocol.Positions:
-        """Positions of the truth, which have no rotations."""
+        """True positions, without rotations."""
         if (section.sigma_m or section.sigma_deg) is not None:
             text = f"truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
@@ -275,7 +275,7 @@ class MotionReader:
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
-        """Refuse rows of which most are more than ``max_gap``, s, apart, so that there is nothing between them."""
+        """Refuse rows that mostly are more than ``max_gap``, s, apart, so that nothing can be interpolated."""
         spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
@@ -286,12 +286,12 @@ class MotionReader:
     def positions(
         self, section: Truth | PositionFile, found: TimedPositions, table: str
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
-        """Positions in metres, and their times (s) of the images' clock; None: they are one a pair.
+        """Positions in metres, and their times (s) by the images' clock; None: one for each pair.
 
         Raises
         ------
         InputError
-            Both have times, and none in common; or not both have, and they are not one a pair.
+            Both have times, but none in common; or not both have, and there is not one position for each pair.
         """
         self.warn(found.warnings)
         if found.times is not None and self.sequence.times is not None:
@@ -306,12 +306,13 @@ class MotionReader:
         return rows, None
 
     def measured(self, section: PositionFile) -> None:
-        """Positions that are measurements, in metres, at times (s) of the images' clock; numbers of pairs without it.
+        """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.
 
         Raises
         ------
         InputError
-            The file holds no positions, or has no times and not one row a pair, or no time in common with the pairs.
+            The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
+            pairs.
         """
         found = positions_of(read_motion(self.root / section.file), "auto", section.columns, section.unit)
         if found is None:
@@ -328,14 +329,14 @@ class MotionReader:
         self.state(priors={**self.sequence.priors, "positions": measured})
 
     def attitude(self, section: Attitude) -> None:
-        """Rotations of a sensor, and the vertical where the file's reference is known to have one."""
+        """Read rotations of a sensor, and the vertical if that is known in the file's reference frame."""
         poses = self.poses(section, "attitude")
         self.state(attitude=tuple(None if pose is None else protocol.rows_of(pose.rotation) for pose in poses))
         if section.up is not None:
             self.state(up=tuple(None if p is None else direction(section.up, p.inverse()) for p in poses))
 
     def imu(self, section: Imu) -> None:
-        """Rotations and vertical by an IMU."""
+        """Read rotations and vertical by an IMU."""
         sequence = self.sequence
         if sequence.times is None:
             text = "[imu] needs times, but the pairs have none"

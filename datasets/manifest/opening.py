@@ -1,8 +1,8 @@
 """Any folder of stereo images as a sequence, described by a manifest (TOML, see :mod:`rille.datasets.manifest.model`).
 
-The manifest says which files are the pairs, what the cameras are, and what else is known: times, truth, attitude,
-odometry, IMU, vehicle. Nothing is repaired silently: what cannot be is an error with the key, what is merely suspicious
-is a warning with its figure, which a run prints and carries on.
+The manifest states the files of the pairs, the cameras, and other known data: times, truth, attitude, odometry, IMU,
+vehicle. Nothing is repaired silently: an impossible value is an error with its key, a suspicious one a warning with its
+figure, which a run prints and goes on.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
 
 
 def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
-    """The sequence of a manifest that a file, or a reader of one layout of folders, has stated.
+    """The sequence of a manifest, which comes from a file or from the reader of a folder layout.
 
     Parameters
     ----------
@@ -76,14 +76,14 @@ def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequen
         georeference=world.place,
         masks={side: root / path for side, path in manifest.masks if path is not None},
         vehicle=manifest.vehicle,
-        # A pinned rig is that of all pieces of a log: none of them may repair it for itself.
+        # A pinned rig is that of all pieces of a log, so no run may repair it.
         defaults={**sequence.defaults, **pinned, **dict(dotted(manifest.defaults))},
         notes=(*sequence.notes, *manifest.notes),
     )
 
 
 def _are_rectified(images: Images, names: Iterable[str]) -> bool:
-    """Whether the images are rectified, as stated or by the names of files and folders, or of topics."""
+    """Whether the images are rectified, as stated, or by the names of files and folders, or of topics."""
     return all(map(RECTIFIED.search, names)) if images.rectified is None else images.rectified
 
 
@@ -114,7 +114,7 @@ def _of_files(manifest: Manifest, root: Path, digests: files.Digests) -> tuple[S
 
 
 def _of_bag(manifest: Manifest, root: Path) -> tuple[Sequence, tuple[ImagePair, ...]] | None:
-    """The same of one that names a bag, whose ``camera_info`` counts where the manifest states no cameras."""
+    """Images and cameras of a manifest that names a bag, whose ``camera_info`` is used if it states no cameras."""
     (path, _, left), (other, _, right) = (text.partition(":") for text in (manifest.images.left, manifest.images.right))
     if path != other or not is_bag(root / path):
         return None
@@ -133,7 +133,8 @@ def _disparity(
     found: tuple[Sequence, tuple[ImagePair, ...]],
     digests: files.Digests,
 ) -> Callable[[int], Source]:
-    """Source of the disparity of a frame that another program made, or of the true one; ``key``: the table's name."""
+    """Function that returns the source of another program's, or of the true disparity of a frame; ``key``: name of the
+    table."""
     sequence, pairs = found
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
@@ -149,7 +150,7 @@ def _disparity(
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
     for first, *_ in maps.values():
-        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # says what is wrong
+        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # raises errors early
 
     def source(frame: int) -> Source:
         paths = {array: of[frames.index(frame)] for array, of in maps.items()}
@@ -161,7 +162,7 @@ def _disparity(
 
 
 def default_name(path: Path) -> str:
-    """Name of a sequence whose manifest states none: that of the file, or of its folder for ``manifest.toml``."""
+    """Name of a sequence whose manifest has none: that of the file, or of its folder for ``manifest.toml``."""
     stem = path.name.removesuffix(".toml").removesuffix(".rille")
     return derived_name(path.resolve().parent.name if stem == "manifest" else stem)
 
@@ -189,7 +190,7 @@ def root_folder(text: str, path: Path) -> Path:
 
 
 def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Digests) -> tuple[ImagePair, ...]:
-    """The pairs that the patterns find; where files are paired by name, some may lack one (``ImagePair.absent``).
+    """The pairs that match the patterns; if paired by name, some may lack a file (``ImagePair.absent``).
 
     Parameters
     ----------
@@ -198,15 +199,15 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
     Raises
     ------
     InputError
-        A pattern finds nothing, both find the same files, or images have no partners.
+        A pattern matches no file, both match the same files, or images have no partners.
     """
     found, search = {}, Search()
     for side, stated in (("left", images.left), ("right", images.right)):
-        # A folder stands for what it holds.
+        # A folder stands for its files.
         pattern = f"{stated.rstrip('/')}/*" if stated and os.path.isdir(root / stated) else stated
         with within(f"images.{side}"):
             paths = search.matching(root, pattern)
-        if pattern.endswith("*"):  # of any kind: then what is no image may lie beside the images
+        if pattern.endswith("*"):  # other files may lie beside the images
             paths = [path for path in paths if path.suffix.lower() in files.SUFFIXES] or paths
         paths = [path for path in paths if digests.whole(path)]
         for path in paths:

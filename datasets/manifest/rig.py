@@ -1,4 +1,4 @@
-"""The rig of a manifest: from calibration files, from figures in the manifest, or from both; and what looks wrong."""
+"""The rig of a manifest: from calibration files, from figures in the manifest, or from both; with warnings."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 
 USUAL_BASELINE = 1.5
-"""m; few vehicles carry a longer one, but a square of a chessboard or a centimetre is a common slip."""
+"""m; few vehicles have a longer one; squares of a chessboard, or centimetres, are common mistakes."""
 
 LONGEST_BASELINE = 20.0
-"""m; no vehicle carries a longer one, but 97 (mm) is a common slip."""
+"""m; no vehicle has a longer one; millimetres are a common mistake."""
 
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
 
 STREET = {"locus.cell_size": 0.1}
-"""0.1 m resolves kerbs where the disparity does."""
+"""0.1 m resolves kerbs as far as the disparity does."""
 
 CAR = 0.3
-"""m, baseline from which a rig is taken for a car's: of a smaller one the cells follow from what its pixels resolve."""
+"""m, least baseline of a rig on a car; for shorter ones the cell size follows from the resolution of the pixels."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What a reconstruction needs of the cameras.
+    """The cameras for a reconstruction.
 
-    ``up`` is the stated direction of up in the left camera's frame; ``warnings`` are lines on what is unusual.
+    ``up`` is the stated direction of up in the left camera's frame; ``warnings`` are lines on unusual properties.
     """
 
     rig: Rig
@@ -54,16 +54,16 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     ----------
     root : folder that calibration files are relative to.
     sizes : of the images.
-    rectified : whether the images are; then their cameras are those that the calibration has for such images.
+    rectified : whether the images are; their cameras are then those of the rectification.
 
     Raises
     ------
     InputError
-        The cameras or their relative pose are not stated, contradict the images, or cannot be.
+        The cameras or their relative pose are not stated, contradict the images, or are impossible.
     """
     raw = _cameras(manifest.cameras, root, sizes)
     left, right = (_rectified(camera) if rectified else camera for camera in raw)
-    # Before anything compares lengths: the manifest's own are metres.
+    # Before lengths are compared: those of the manifest are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
     above = manifest.world.up
     up = None if above is None else direction(above, left.T_camera_reference)
@@ -102,7 +102,7 @@ def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[CalibratedCame
 
 
 def _rectified(camera: CalibratedCamera) -> CalibratedCamera:
-    """The camera of rectified images; the one that there is where it has no distortion."""
+    """The camera of rectified images; the camera itself if it has no distortion."""
     if camera.rectified is None and not camera.lens.ideal:
         raise InputError(
             "RIL-816",
@@ -114,7 +114,7 @@ def _rectified(camera: CalibratedCamera) -> CalibratedCamera:
 
 
 def _one(value: str | PinholeLens, side: str, root: Path, size: tuple[int, int]) -> CalibratedCamera:
-    """The camera of one side: of a file with one camera, or of figures."""
+    """The camera of one side: from a file with one camera, or from figures."""
     if isinstance(value, str):
         found = read_cameras(root / value)
         if len(found) != 1:
@@ -133,7 +133,7 @@ def _one(value: str | PinholeLens, side: str, root: Path, size: tuple[int, int])
 
 
 def _of_file(section: Cameras, path: Path, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
-    """Left and right camera of one file; a single camera is taken for both."""
+    """Left and right camera of one file; a single camera is used for both."""
     found = read_cameras(path)
     if section.names is not None:
         by_name = {camera.name: camera for camera in found}
@@ -147,13 +147,13 @@ def _of_file(section: Cameras, path: Path, sizes: Sizes) -> tuple[CalibratedCame
         text = f"{path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
         raise InputError("RIL-238", text, remedy="say which two by cameras.names = [left, right]")
     if len(found) == 1:
-        # Its pose, if it has one, is that of one camera: where the other one stands the manifest has to say.
+        # Its pose, if any, is that of one camera: the manifest has to state the other.
         return found[0], replace(found[0], name="right", T_camera_reference=None)
     return found[0], found[1]
 
 
 def _scaled(camera: CalibratedCamera, unit: float) -> CalibratedCamera:
-    """With lengths in metres."""
+    """The camera with lengths in metres."""
     pose = camera.T_camera_reference
     if pose is None or unit == 1.0:
         return camera
@@ -172,7 +172,7 @@ def direction(
 def _placed(
     left: CalibratedCamera, right: CalibratedCamera, stated: RigidTransform | None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
-    """Both cameras with poses in the left camera's frame: what the manifest says goes before what a file says."""
+    """Both cameras with poses in the left camera's frame, by the manifest, else by the files; and warnings."""
     of_files = None
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
@@ -184,7 +184,7 @@ def _placed(
     lines = []
     if stated is not None and of_files is not None:
         ours, theirs = (float(np.linalg.norm(T.translation)) for T in (stated, of_files))
-        # Relative difference of two stated baselines that is no contradiction
+        # 0.01: largest relative difference of two stated baselines without a contradiction.
         if theirs > 0 and abs(ours - theirs) > 0.01 * theirs:
             text = f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m"
             lines.append(warning("RIL-693", text))
@@ -193,7 +193,7 @@ def _placed(
 
 
 def _pinned(path: Path) -> Rig:
-    """The rig of a file that ``rille rig`` wrote."""
+    """The rig of a file by ``rille rig``."""
     content = read_toml(path, "rig")
     try:
         return Rig.from_dict(content["rig"])
@@ -209,7 +209,7 @@ def _stated(section: RigSection) -> RigidTransform | None:
 
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:
-    """Refuse a length (m) that looks like one in another unit, or warn of it, unless the unit is stated."""
+    """Refuse a length (m) that looks like one in another unit, or warn about it, unless the unit is stated."""
     from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
@@ -226,7 +226,7 @@ def check_baseline(baseline: float, section: RigSection) -> list[str]:
 
 
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
-    """Lines on a left and a right camera that are possible but strange, given images of these sizes."""
+    """Warnings about a left and a right camera that are possible but unusual for images of these sizes."""
     lines = []
     for side, calibrated, (width, height) in zip(("left", "right"), cameras, sizes, strict=True):
         c = calibrated.lens.camera
@@ -235,8 +235,7 @@ def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: S
             text = f"{side} camera: fx = {c.fx:g} px gives an angle of view of {view:.3g} degrees; is it in pixels?"
             lines.append(warning("RIL-690", text))
         off = max(abs(c.cx - width / 2), abs(c.cy - height / 2)) / width
-        # 0.04: the limit where a calibration states no size: then images that were cut show by
-        # nothing else.
+        # 0.04: limit for a calibration without a size, since cropped images show by nothing else.
         if off > (0.04 if calibrated.size is None else MAX_OFF_CENTRE):
             place = (
                 f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height} images"

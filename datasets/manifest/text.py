@@ -1,4 +1,4 @@
-"""A commented manifest of what was found in a folder, with what is missing marked where it belongs."""
+"""A commented manifest of the findings in a folder, with marks at missing entries."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 
 NEEDED = "NEEDED"
-"""Marks a line that must be filled in before the manifest opens."""
+"""Mark of a line that must be filled in before the manifest opens."""
 
 
 def manifest_text(found: Findings, root: str) -> str:
@@ -26,9 +26,9 @@ def manifest_text(found: Findings, root: str) -> str:
         loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters["toml"] = _value
-    # Names of files may hold line breaks: what follows one would be no comment, but a key.
+    # Names of files may hold line breaks, which would end a comment.
     environment.finalize = lambda value: " ".join(value.splitlines()) if isinstance(value, str) else value
-    # File beside this module: the manifest with places for what was found
+    # The template, beside this module, has fields for the findings.
     return environment.get_template("template.toml.jinja").render(
         **vars(found),
         name=derived_name(found.folder.resolve().name),
@@ -41,28 +41,28 @@ def manifest_text(found: Findings, root: str) -> str:
 
 
 def _mount(calibration: FoundCalibration | None) -> str:
-    """Where the left camera stands in the body that the calibration is of, or an example, as the value of a key."""
+    """Pose of the left camera in the calibration's reference frame, or an example, as the value of a key."""
     stated = np.eye(3, 4) if calibration is None or calibration.mount is None else calibration.mount.matrix34
     return "[{}]".format(", ".join(f"[{', '.join(f'{x:.9g}' for x in row)}]" for row in stated))
 
 
 def _value(value: Any) -> str:
-    """A value as TOML writes it."""
+    """A value in TOML."""
     return tomli_w.dumps({"key": value}).removeprefix("key = ").rstrip()
 
 
 def needs(text: str) -> list[str]:
-    """What a manifest's text marks as needed, one line each."""
+    """Lines of a manifest's text that are marked as needed."""
     return [line.split(NEEDED, 1)[1].lstrip(": ") for line in text.splitlines() if f"# {NEEDED}:" in line]
 
 
 def pair_words(views: FoundImages) -> str:
-    """How many pairs there are, and whether some lack an image."""
+    """Number of pairs, and of those that lack an image, in words."""
     gaps, words = views.absent, count(views.pairs, "pair")
     more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
     return f"{words} ({gaps[0]}{more})" if gaps else words
 
 
 def size_words(sizes: Iterable[tuple[int, int] | None]) -> str:
-    """Sizes that are known, each once."""
+    """The distinct known sizes, in words."""
     return " and ".join(dict.fromkeys(f"{size[0]} x {size[1]}" for size in sizes if size is not None))

@@ -1,4 +1,4 @@
-"""Stage ``mockup.obstacle``: a stone laid on the way after its ground was mapped."""
+"""Stage ``mockup.obstacle``: a stone laid on the path after its ground was mapped."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def lay(scene: Bundle, x: float, y: float) -> dict[str, Any]:
     z[inside] = np.maximum(z[inside], ground + STONE_HEIGHT_M * (1.0 - q[inside] ** 4))
     arrays["height"] = z
     arrays["tint"] = np.where(inside, np.uint8(120), arrays["tint"])
-    # Shadows are part of the scene, not of the image: the stone casts one, and may stand in another.
+    # Shadows are part of the scene: the stone casts one, and may stand in another.
     arrays["sunlit"] = terrain.sunlit(z, SceneParams(**scene.meta["scene"]))
     return arrays
 
@@ -61,8 +61,8 @@ def obstacle_stage(
         return Bundle({name: np.asarray(scene[name]) for name in scene.arrays}, {**scene.meta, "obstacle": None})
     (true_x, true_y, true_heading), (x, y, heading) = true_and_believed(before, row, pose, T_vehicle_left)
     px, py = on_path(path, params.obstacle_ahead, params.obstacle_aside)
-    # The path is in the frame of the rover's estimate: the stone is laid where it will really come by, so that errors
-    # of the estimate do not carry it past.
+    # The path is in the frame of the rover's estimate: the stone is laid on its true path, so that errors of the
+    # estimate do not lead past it.
     turn = true_heading - heading
     c, s = math.cos(turn), math.sin(turn)
     stone = true_x + c * (px - x) - s * (py - y), true_y + s * (px - x) + c * (py - y)

@@ -1,4 +1,4 @@
-"""Stage ``mockup.overview``: a coarse elevation model of the whole bed, as an orbiter's camera would give it."""
+"""Stage ``mockup.overview``: a coarse elevation model of the whole bed, as from an orbiter's camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def overview_stage(params: RoverParams, scene: Bundle[SceneFacts], *, cell: floa
     """A coarse elevation model of the whole simulated bed."""
     at, z = scene.meta["lattice"], np.asarray(scene["height"], dtype=np.float64)
     n = max(1, round(cell / at["cell"]))
-    # Cells at multiples of their size, those alone that lie wholly within the bed.
+    # Cells at multiples of their size that lie wholly within the bed.
     i0, j0 = math.ceil(at["x0"] / cell + 0.5), math.floor(at["y0"] / cell - 0.5)
     cols = math.floor((at["x0"] + at["cell"] * (at["cols"] - 1)) / cell - 0.5) - i0 + 1
     rows = j0 - math.ceil((at["y0"] - at["cell"] * (at["rows"] - 1)) / cell + 0.5) + 1

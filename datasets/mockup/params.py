@@ -1,6 +1,6 @@
 """Parameters of the simulated experiment, and the parts of them that bed and camera read.
 
-The figures are the paper's (sections 3.2, 7.1-7.4) where it gives them.
+The figures are the paper's (sections 3.2, 7.1-7.4), as far as it states them.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class SetupParams(SceneParams, RenderParams):
     )
 
     def part(self, kind: type[Part]) -> Part:
-        """The parameters of one half, bed or camera."""
+        """The parameters of one part, bed or camera."""
         return kind(**{name: getattr(self, name) for name in kind.model_fields})
 
 

@@ -1,7 +1,7 @@
-"""Where rays first meet a bilinear height field: exact, by skipping blocks that lie wholly below the ray.
+"""First intersection of rays with a bilinear height field: exact, by skipping blocks that lie wholly below the ray.
 
 A pyramid of block maxima (as in Tevs, Ihrke, Seidel 2008, doi:10.1145/1342250.1342279) decides how far a ray may
-jump; inside one cell the surface is the bilinear patch of its four heights and the meeting point a root of a quadratic.
+jump; inside one cell the surface is the bilinear patch of its four heights, and the intersection a root of a quadratic.
 """
 
 from __future__ import annotations
@@ -91,14 +91,14 @@ def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
         o = i if origins.shape[0] > 1 else 0
         oc, orow, oz = origins[o, 0], origins[o, 1], origins[o, 2]
         dc, dr, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        # what drifts by less than a millionth of a cell on the way through the bed is vertical
+        # A ray that moves by less than a millionth of a cell on its way through the bed is vertical.
         if abs(dc) < 1e-7 * abs(dz):
             dc = 0.0
         if abs(dr) < 1e-7 * abs(dz):
             dr = 0.0
         inv_c = 1.0 / dc if dc != 0.0 else np.inf
         inv_r = 1.0 / dr if dr != 0.0 else np.inf
-        # clip the ray to the outline and to what lies below the highest point
+        # Clip the ray to the outline and to below the highest point.
         enter_c, leave_c = _within(oc, dc, inv_c, edge_c)
         enter_r, leave_r = _within(orow, dr, inv_r, edge_r)
         t, end = max(0.0, enter_c, enter_r), min(leave_c, leave_r)
@@ -125,15 +125,15 @@ def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
             if level > 0:
                 level -= 1
                 continue
-            # the bilinear patch: gap(s) = f0 + f1 s + f2 s^2 along the ray
-            # (before the nudge that led here, lest a steep ray passes the surface within it)
+            # The bilinear patch: gap(s) = f0 + f1 s + f2 s^2 along the ray, from before the nudge that led here, within
+            # which a steep ray may pass the surface.
             at = t - nudge
             u, v = oc + at * dc - ic, orow + at * dr - ir
             h00, h01 = np.float64(height[ir, ic]), np.float64(height[ir, ic + 1])
             h10, h11 = np.float64(height[ir + 1, ic]), np.float64(height[ir + 1, ic + 1])
             bc, br, bcr = h01 - h00, h10 - h00, h11 - h10 - h01 + h00
             f0 = oz + at * dz - (h00 + bc * u + br * v + bcr * u * v)
-            # Below the surface already: the ray came in through the bed's side and meets nothing, or it is rounding.
+            # Below the surface: by rounding, or the ray came in through the bed's side and meets nothing.
             if f0 <= 0.0:
                 out[i] = at if nudge > 0.0 or f0 > -1e-9 else -np.inf
                 break
@@ -142,7 +142,7 @@ def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
             if s <= t_exit + eps - at:
                 out[i] = at + s
                 break
-            # The next patch is mostly a neighbour: the pyramid is climbed again from below, not entered at the top.
+            # The next patch is mostly a neighbour, so climb the pyramid from below.
             t, nudge, level = t_exit + eps, eps, min(1, top)
     return out
 

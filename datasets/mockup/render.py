@@ -1,6 +1,6 @@
 """Stage ``mockup.render``: one image of the bed by one camera.
 
-Some rays a pixel; McEwen's lunar-Lambert reflectance 2 L mu0 / (mu0 + mu) + (1 - L) mu0 (doi:10.1016/0019-1035(91)
+Some rays per pixel; McEwen's lunar-Lambert reflectance 2 L mu0 / (mu0 + mu) + (1 - L) mu0 (doi:10.1016/0019-1035(91)
 90038-7), the first term Lommel-Seeliger; anisotropic look-up of the albedo pyramid by footprint; then optics blur,
 vignetting, exposure, noise and quantisation.
 """
@@ -25,7 +25,7 @@ from rille.stages.core.declare import Array, Bundle, Memory, stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 MCEWEN_L = 0.6
-"""McEwen's L near 70 degrees of phase angle, the usual one here."""
+"""McEwen's L near a phase angle of 70 degrees, usual here."""
 AMBIENT_LIGHT = 0.05
 """Stray light of the room, relative to the lamp on a surface that faces it."""
 
@@ -37,7 +37,7 @@ def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1)
     y = (np.arange(camera.height)[:, None] + offset).ravel()
     columns, rows = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
     r = T_bed_camera.rotation
-    # written out, not as a matrix product: the same bits from any BLAS
+    # Written out instead of a matrix product, for the same bits with any BLAS.
     return np.stack([columns * r[k, 0] + rows * r[k, 1] + r[k, 2] for k in range(3)], axis=-1).reshape(-1, 3)
 
 
@@ -64,7 +64,7 @@ class _Bed(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
-    """Radiance (n,) of the hit points, NaN where a ray hit nothing; ``albedo``: its levels, the finest first."""
+    """Radiance (n,) of the hit points, NaN for rays without one; ``albedo``: its levels, the finest first."""
     height, cell, sun = bed.height, bed.cell, bed.sun
     n = directions.shape[0]
     out = np.full(n, np.nan, np.float32)
@@ -78,21 +78,21 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
         c, r = (x - bed.x0) / cell, (bed.y0 - y) / cell
         vx, vy, vz = -dx / length, -dy / length, -dz / length
         minor = t * length * pixel_angle
-        # slopes over the footprint, at least over one cell: what a pixel averages is not resolved
+        # Slopes over the footprint, or one cell if that is larger: finer ones are not resolved.
         s = max(1.0, 0.5 * minor / cell)
         gx = (_bilinear(height, r, c + s) - _bilinear(height, r, c - s)) / (2.0 * s * cell)
         gy = (_bilinear(height, r - s, c) - _bilinear(height, r + s, c)) / (2.0 * s * cell)
         norm = math.sqrt(1.0 + gx * gx + gy * gy)
         mu0 = max((sun[2] - gx * sun[0] - gy * sun[1]) / norm, 0.0)
-        # A slope taken over the footprint may face away from a camera that sees the point: the cosine stays positive.
+        # A slope over the footprint may face away from a camera that sees the point: keep the cosine positive.
         mu = max((vz - gx * vx - gy * vy) / norm, 0.05)
         lit = _bilinear(bed.sunlit, r, c) / 255.0
         # Lunar-Lambert: Lommel and Seeliger's law, which knows no limb darkening, mixed with Lambert's.
         direct = lit * (2.0 * MCEWEN_L * mu0 / (mu0 + mu) + (1.0 - MCEWEN_L) * mu0) if mu0 > 0.0 else 0.0
-        # grain is draped over rocks, not projected from above, so that walls that face the drive are not streaked; a
-        # slope's own rise drapes nothing, lest its far end lies beyond the grain
+        # Grain is draped over rocks, not projected from above, so that walls are not streaked; without the rise of a
+        # sloped bed, whose far end would lie beyond the grain.
         drape = (origin[2] + t * dz - bed.rise * y) / cell
-        # footprint on the ground: an ellipse drawn out along the line of sight
+        # Footprint on the ground: an ellipse stretched along the line of sight.
         stretch = min(1.0 / mu, 8.0)
         taps = int(stretch + 0.5)
         flat = math.sqrt(vx * vx + vy * vy) + 1e-12
@@ -130,7 +130,7 @@ def _bilinear(a, r, c):  # type: ignore[no-untyped-def]
 def _texel(albedo, level, r, c):  # type: ignore[no-untyped-def]
     """Bilinear value of one level of the albedo at (row, column) of level 0."""
     size = float(1 << level)
-    # A texel of a coarser level lies in the middle of those that it is the mean of, not on the first of them.
+    # A texel of a coarser level lies in the middle of those that it is the mean of.
     return _bilinear(albedo[level], (r + 0.5) / size - 0.5, (c + 0.5) / size - 0.5)
 
 
@@ -145,7 +145,7 @@ def radiance(
     rays = camera_rays(camera, T_bed_camera, sampling)
     origin = T_bed_camera.translation
     distance = field.cast(origin[None, :], rays)
-    # Copies, lest some levels are read-only and others not: one type for all.
+    # Copies, so that all levels have one type, none read-only.
     albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(ALBEDO_LEVELS))
     light = scene.meta["scene"]
     e, a = math.radians(light["sun_elevation_deg"]), math.radians(light["sun_azimuth_deg"])
@@ -186,24 +186,24 @@ def render_stage(
 ) -> Bundle[ImageFacts]:
     """One image of the simulated bed."""
     blocks, mask = radiance(scene, height_field(scene), geometry, T_bed_camera, params.sampling)
-    # A stream for each image: its noise depends neither on which others are rendered nor on their order.
+    # A stream for each image, whose noise does not depend on other images.
     rng = np.random.default_rng([params.seed, 50, frame, CAMERAS.index(camera)])
     mu0 = math.sin(math.radians(scene.meta["scene"]["sun_elevation_deg"]))
-    # Radiance of level ground of mean albedo, seen as the camera's axis sees it.
+    # Radiance of level ground of mean albedo on the camera's axis.
     # 0.31: cosine of the emission angle for which the exposure is set: ground seen 18 degrees below the horizon.
     flat = 2.0 * MCEWEN_L * mu0 / (mu0 + 0.31) + (1.0 - MCEWEN_L) * mu0 + AMBIENT_LIGHT
     # 112.0: grey level of sunlit level ground; shadows and vignetting bring the mean of a picture to about 100.
     gain = 112.0 / flat * params.exposure * (1.0 + params.exposure_jitter * float(rng.standard_normal()))
     # No two cameras are equally sensitive.
     gain *= 0.97 if camera == "right" else 1.0
-    # Behind the bed the room is dark.
+    # The room around the bed is dark.
     samples = np.where(np.isnan(blocks), np.float32(9.0), blocks * np.float32(gain))
     # The optics' point spread.
     grey = scipy.ndimage.gaussian_filter(samples.astype(np.float64).mean(axis=(1, 3)), 0.6, mode="nearest")
     y, x = np.ogrid[-1.0 : 1.0 : geometry.height * 1j, -1.0 : 1.0 : geometry.width * 1j]
     # A tenth of the light is lost in the corners.
     grey = grey * (1.0 - 0.1 * (x * x + y * y) / 2.0)
-    # Noise arises in the sensor, behind the optics: it is neither blurred nor vignetted, and white.
+    # Noise of the sensor: white, neither blurred nor vignetted.
     noisy = grey + params.noise * rng.standard_normal(grey.shape)
     image = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
     return Bundle({"image": image, "valid": mask.astype(np.uint8)}, {"frame": frame, "camera": camera})

@@ -1,9 +1,9 @@
 """Stage ``mockup.drive``: a rover that drives one leg over the simulated bed, with slip and errors of its heading.
 
 The stage gets a path and the rover's estimated pose, both in the frame of the estimate. The rover turns towards each
-vertex and drives there by its wheels. Its true motion differs from that of the wheels: it slips and drifts off its
-heading. The body follows the wheels over the ground (:mod:`rille.stages.planning.wheels`). The rover does not know the
-results of this stage; stage ``mockup.sense`` simulates the readings of its sensors.
+vertex and drives there by its wheels. Its true motion differs from that of the wheels by slip and drift of heading. The
+body follows the wheels over the ground (:mod:`rille.stages.planning.wheels`). The rover does not know the results of
+this stage; stage ``mockup.sense`` simulates the readings of its sensors.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class _Step(NamedTuple):
 
 
 class DrivenLeg(NamedTuple):
-    """``trail``, how the vehicle stood on the way; ``wheels``, its x, y (m) and heading (rad) as they turned."""
+    """``trail``: stands of the vehicle along the leg; ``wheels``: x, y (m) and heading (rad) by the wheels."""
 
     trail: list[Stand]
     wheels: list[RoverPose]
@@ -113,7 +113,7 @@ def _steps(believed: RoverPose, sent: SentLeg, p: RoverParams, rng: np.random.Ge
         way, towards = math.hypot(dx, dy), math.atan2(-dx, dy)
         n = max(1, math.ceil(way / STEP_M))
         rolled = sign * way / n
-        # remainder() gives the shorter way round, -pi to pi.
+        # remainder() gives the shorter turn, -pi to pi.
         yield from rotate(math.remainder(towards - heading, 2 * math.pi))
         yield from itertools.repeat(_Step((1.0 - slip) * rolled, drift * way / n, rolled, 0.0), n)
         x, y, heading = float(vertex[0]), float(vertex[1]), towards
@@ -157,8 +157,8 @@ def drive_leg(
 
 
 def images_at(wheels: Floats, p: RoverParams) -> list[int]:
-    """Positions (of wheels (n, 3): x, y in m, heading in rad) at which an image is taken: the first, the last, and
-    whenever the way or the turn since the last one is large enough."""
+    """Rows of ``wheels`` (n, 3), x, y in m, heading in rad, at which an image is taken: the first, the last, and
+    whenever the distance or the turn since the last one is large enough."""
     at, way, turn = [0], 0.0, 0.0
     for k in range(1, len(wheels)):
         dx, dy, dh = wheels[k] - wheels[k - 1]
@@ -175,7 +175,7 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
     height = np.asarray(scene["height"], np.float64)
     x0, y0, cell = (scene.meta["lattice"][name] for name in ("x0", "y0", "cell"))
     (x, y), (n, m) = at, height.shape
-    # Never fewer than two nodes a side, between which heights are bilinear: beside the bed, those next to it.
+    # At least two nodes per side, for bilinear heights; outside of the bed those next to it.
     rows, cols = (
         slice(min(max(int(low / cell), 0), most - 2), min(max(int(high / cell) + 2, 2), most))
         for low, high, most in ((y0 - (y + reach), y0 - (y - reach), n), (x - reach - x0, x + reach - x0, m))
@@ -186,7 +186,7 @@ def bed_ground(scene: Bundle, vehicle: Vehicle, at: tuple[float, float], reach: 
 
 
 class DriveInputs(NamedTuple):
-    """The bed; and of a leg, None at the start: where the rover truly stands, the estimated poses, and the leg."""
+    """The bed; and for a leg (None at the start) the true pose of the rover, the estimated poses, and the leg."""
 
     scene: Bundle[SceneFacts]
     before: Bundle[DrivenFacts] | None = None
@@ -231,7 +231,7 @@ def drive_stage(
     if inputs.before is not None and inputs.pose is not None and plan is not None:
         start, believed = true_and_believed(inputs.before, row, inputs.pose, T_vehicle_left)
         sent = SentLeg(np.asarray(plan["path"])[:, :2], np.asarray(plan["gear"]).tolist(), float(plan.meta["turn"]))
-    # Ground beside the leg may be touched, too.
+    # 0.3 m: the rover may touch ground beside the leg.
     ground = bed_ground(inputs.scene, vehicle, start[:2], way_length(sent.path) + 0.3)
     # The placement at the start is leg -1, and a seed must not be negative.
     rng = np.random.default_rng([params.seed, 70, 1 + leg])

@@ -1,4 +1,4 @@
-"""Stage ``mockup.scene``: the whole bed as one artifact, which every image and every truth reads.
+"""Stage ``mockup.scene``: the whole bed as one artifact, for all images and truths.
 
 For a drive it has a smooth pad to start from, and may have a patch without texture.
 """
@@ -25,7 +25,7 @@ Disk = tuple[float, float, float]
 """x, y and radius of a disk on the bed, metres."""
 
 PAD_EDGE_M = 0.06
-"""m; over which the pad passes into the ground around it."""
+"""m; width of the transition from the pad to the ground around it."""
 
 
 def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = None) -> Bundle[SceneFacts]:
@@ -50,7 +50,7 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
     lattice = {"x0": -0.5 * (cols - 1) * p.cell, "y0": (rows - 1) * p.cell, "cell": p.cell, "rows": rows, "cols": cols}
     height = terrain.relief(p, (rows, cols))
     terrain.add_craters(height, p)
-    # Before the rocks: the cameras' height counts from the mean of the bare ground.
+    # Before the rocks, since the cameras' height counts from the mean of the bare ground.
     height -= np.float32(height.mean(dtype=np.float64))
     slope = (np.tan(np.deg2rad(p.slope_deg)) * p.cell * np.arange(rows - 1, -1, -1)).astype(np.float32)[:, None]
     height += slope
@@ -62,7 +62,7 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
             continue
         x, y, radius = disk
         far = distance(lattice, height.shape, p.cell, x, y)
-        if not (far <= radius).any():  # beside the bed, or less than a cell: no ground has a height to take
+        if not (far <= radius).any():  # outside of the bed, or less than a cell: no ground for a height
             continue
         weight = np.clip((radius + PAD_EDGE_M - far) / PAD_EDGE_M, 0.0, 1.0)
         # Smoothstep: the slope has no kink at either end of the edge.
@@ -71,14 +71,13 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
         height = (height + weight * (slope + level - height)).astype(np.float32)
         tint = np.where(weight > 0.5, np.uint8(100), tint)
         if disk is blank:
-            bare = x, y + level, radius  # the grain is draped: what lies at a height has that of as much farther ahead
+            bare = x, y + level, radius  # grain is draped: that of raised ground is from as much farther ahead
     arrays: dict[str, Any] = {"height": height, "sunlit": terrain.sunlit(height, p), "tint": tint}
     for k in range(ALBEDO_LEVELS):
         arrays[f"albedo_{k}"] = texture
         if bare is not None:
             x, y, radius = bare
-            # A texel of a coarser level lies in the middle of those that it is the mean of, half of them behind the
-            # first one.
+            # A texel of a coarser level lies in the middle of those that it is the mean of.
             middle = 0.25 * p.cell * (2**k - 1)
             far = distance(lattice, texture.shape, 0.5 * p.cell * 2**k, x - middle, y + middle)
             arrays[f"albedo_{k}"] = np.where(far <= radius, np.uint8(128), texture)
@@ -89,14 +88,14 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
 def distance(
     lattice: Mapping[str, Any], shape: tuple[int, ...], spacing: float, x: float, y: float
 ) -> NDArray[np.float64]:
-    """Distance (row, col), metres, of the nodes of a grid of the bed from a point of it."""
+    """Distance (row, col), metres, of the nodes of a grid of the bed from a point."""
     dx = lattice["x0"] + spacing * np.arange(shape[1]) - x
     dy = lattice["y0"] - spacing * np.arange(shape[0]) - y
     return np.asarray(np.hypot(dx[None, :], dy[:, None]))
 
 
 def height_field(scene: Bundle) -> HeightField:
-    """The scene's heights, ready for ray casting."""
+    """The scene's heights for ray casting."""
     lattice = scene.meta["lattice"]
     return HeightField.build(np.asarray(scene["height"][:]), lattice["x0"], lattice["y0"], lattice["cell"])
 

@@ -1,6 +1,6 @@
-"""Stage ``mockup.sense``: what the rover's sensors report of a leg: wheels, inclinometer, accelerometer.
+"""Stage ``mockup.sense``: readings of the rover's sensors on a leg: wheels, inclinometer, accelerometer.
 
-This, and the images, is all that the estimates ever learn of a drive.
+Estimates of a drive use these readings and the images alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rille.stages.geometry.geometry import rotation_exp
 
 
 def _peaks(z: Floats, wheels: Floats) -> Floats:
-    """Vertical acceleration (position,), m/s2, of the body at its driving speed; none where it turns on the spot."""
+    """Vertical acceleration (position,), m/s2, of the body at its driving speed; 0 for turns on the spot."""
     out = np.zeros(len(z))
     # The vehicle drives at 0.05 m/s.
     seconds = np.hypot(*np.diff(wheels[:, :2], axis=0).T) / 0.05
@@ -40,16 +40,15 @@ def sense_stage(params: RoverParams, drive: Bundle[DrivenFacts], *, leg: int) ->
     rng = np.random.default_rng([params.seed, 71, 1 + leg])
     at = np.asarray(drive["frame_at"])
     wheels, poses = np.asarray(drive["wheels"])[at], np.asarray(drive["poses"])
-    # One error for the whole leg: it does not average out over the leg's images. Distances and turns are wrong by one
-    # factor, as the wheels' radius is.
+    # One factor for the whole leg, as by an error of the wheels' radius, which does not average out.
     odometry = wheels * (1.0 + 0.01 * float(rng.standard_normal()))
-    # Of the inclinometer, about each axis.
+    # 0.2 degrees: of the inclinometer, about each axis.
     sigma = math.radians(0.2)
     # The third row of R_bed_left is the bed's z axis, in axes of the camera.
     up = np.stack([rotation_exp(sigma * rng.standard_normal(3)) @ pose[2, :3] for pose in poses])
     peak = _peaks(np.asarray(drive["trail"])[:, 2, 3], np.asarray(drive["wheels"]))
     acceleration = [float(peak[a + 1 : b + 1].max(initial=0.0)) for a, b in zip([0, *at[:-1]], at, strict=True)]
-    # m/s2, of the accelerometer.
+    # 0.05 m/s2: of the accelerometer.
     noise = 0.05 * rng.standard_normal(len(at))
     arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
     return Bundle(arrays, {"leg": leg, "up": up.tolist(), "odometry": odometry.tolist()})

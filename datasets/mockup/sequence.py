@@ -1,6 +1,6 @@
-"""The simulated experiment as a sequence, recorded or driven: where the cameras stand, what is given and known.
+"""The simulated experiment as a sequence, recorded or driven: poses of the cameras, given data and truth.
 
-A driven rover moves as the closed loop decides from its images.
+The closed loop decides the motion of a driven rover from its images.
 
 Frames: the bed frame (truth) has z up, y ahead, x right and its origin in the middle of the bed's near edge at mean
 height. The body frame moves with the rig: y ahead, x along the baseline to the right, z up, origin between the cameras.
@@ -47,8 +47,8 @@ LOOP: Mapping[str, Any] = {
     "rocks": 12.0,
     "craters": 4.0,
 }
-"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m before them to the horizon;
-one ray a pixel, since a drive takes a hundred of them."""
+"""``mockup-loop``: small images of wide-angle cameras, which see the ground from 0.08 m ahead to the horizon; one ray
+per pixel, since a drive takes a hundred images."""
 
 EXACT_CALIBRATION = 1e-5
 """Standard deviation of the simulated cameras' focal length and principal point, over the focal length."""
@@ -62,18 +62,17 @@ LOOP_DEFAULTS: Mapping[str, Any] = {
     "crosscheck.enabled": False,
     "drive.goal": (0.0, 1.0),
 }
-"""Accurate terrain, since what a map smooths away is met by a wheel: of the cells with an edge above ``max_step`` (six
-beds, three stops each) half as many have a probability below 0.3, none below 0.06 (0.5 %), and a tenth fewer cells are
-false hazards. It takes a quarter more time a stop. Poses need no more points than by default. A leg is a segment of its
-own: adjusted jointly its frames err less, but where it ends the rover is found no better, and one of 15 drives lost its
-way."""
+"""Accurate terrain, because wheels meet edges that a map smooths away: of the cells with an edge above ``max_step``
+(six beds, three stops each) half as many have a probability below 0.3, none below 0.06 (0.5 %), and a tenth fewer cells
+are false hazards. A stop takes a quarter more time. Poses need no more points than by default. Each leg is a segment:
+with a joint adjustment its frames err less, but the pose at its end does not, and one of 15 drives lost its way."""
 
 
 def mount(p: SetupParams, camera: str) -> RigidTransform:
     """T_body_camera of the true rig."""
     side = -1.0 if camera == "left" else 1.0
     toe, pitch = math.radians(p.toe_in_deg), math.radians(p.pitch_deg)
-    # optical axes of a level camera that looks along y: x right, y down, z ahead
+    # Optical axes of a level camera that looks along y: x right, y down, z ahead.
     level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     inward = rotation_exp([0.0, 0.0, side * toe])
     down = rotation_exp([-pitch, 0.0, 0.0])
@@ -83,7 +82,7 @@ def mount(p: SetupParams, camera: str) -> RigidTransform:
 def body_poses(p: MockupParams) -> list[RigidTransform]:
     """T_bed_body of every frame: equal steps of the body on the mean plane, with turns, roll and jitter."""
     turns = np.deg2rad(p.turn_deg) * np.arange(p.frames)
-    # Each step leads where the body heads half-way: of a constant turn these are chords of one circle.
+    # Each step follows the heading half-way: with a constant turn they are chords of a circle.
     ahead = turns - 0.5 * np.deg2rad(p.turn_deg)
     steps = np.column_stack(
         [
@@ -93,9 +92,9 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     )
     steps[0] = 0.0
     offsets = np.cumsum(steps, axis=0)
-    # The drive is centred across the bed, whichever way it drifts.
+    # The drive is centred across the bed.
     offsets[:, 0] -= 0.5 * (offsets[:, 0].min() + offsets[:, 0].max())
-    # One that turns looks to all sides, and is centred along the bed as well.
+    # A drive with turns looks to all sides, and is centred along the bed too.
     middle = 0.5 * (p.bed_length - offsets[:, 1].min() - offsets[:, 1].max())
     offsets[:, 1] += middle if p.turn_deg else FIRST_Y_M - min(offsets[:, 1].min(), 0.0)
     shakes = np.deg2rad(p.jitter_deg) * np.random.default_rng([p.seed, 60]).standard_normal((p.frames, 3))
@@ -119,7 +118,7 @@ def true_rig(p: SetupParams) -> Rig:
 
 
 def given_rig(p: SetupParams) -> Rig:
-    """The rig as it is handed to the reconstruction: the true one with the stated error."""
+    """The rig given to the reconstruction: the true one with the stated error."""
     rig = true_rig(p)
     error = RigidTransform(rotation_exp(np.deg2rad(p.rig_error_deg)), np.zeros(3))
     return Rig(rig.left, rig.right, error @ rig.T_right_left)
@@ -140,21 +139,21 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
 
 
 def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] | None:
-    """R_bed_left of each frame, as a sensor with the stated error gives it."""
+    """R_bed_left of each frame by a sensor with the stated error."""
     if p.attitude_noise_deg is None:
         return None
     errors = np.deg2rad(p.attitude_noise_deg) * np.random.default_rng([p.seed, 61]).standard_normal((p.frames, 3))
-    # The sensor errs about the camera's axes: the error stands before R_left_bed, the transposed rotation.
+    # Errors are about the camera's axes, so they multiply R_left_bed, the transposed rotation, from the left.
     return tuple(rows_of((rotation_exp(e) @ T.rotation.T).T) for e, T in zip(errors, truth, strict=True))
 
 
 def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
-    """Direction of up in each left camera, as an inclinometer with the stated error gives it."""
+    """Direction of up in each left camera by an inclinometer with the stated error."""
     if not p.inclinometer:
         return None
     out = []
     for frame, pose in enumerate(truth):
-        # A stream for each frame: its error stays the same however many frames there are.
+        # A stream for each frame, whose error does not depend on the number of frames.
         error = np.random.default_rng([p.seed, 62, frame]).standard_normal(3)
         x, y, z = rotation_exp(np.deg2rad(p.up_noise_deg) * error) @ pose.rotation[2]
         out.append((float(x), float(y), float(z)))
@@ -163,7 +162,7 @@ def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, floa
 
 @dataclass(frozen=True)
 class Sources:
-    """Sources of images and truth of an experiment; ``inputs``: the scene, where it is the same for all of them."""
+    """Sources of images and truth of an experiment; ``inputs``: the scene, if it is the same for all of them."""
 
     rig: Rig
     inputs: Mapping[str, Source]
@@ -190,7 +189,7 @@ class Sources:
         return Source("rille.datasets.mockup.truth", NoParams(), args, inputs=self.inputs)
 
     def dem(self, lattice: Mapping[str, Any], T_bed_world: RigidTransform, lefts: Iterable[RigidTransform]) -> Source:
-        """True elevations, and which of them the pairs at some places see."""
+        """True elevations, and whether pairs at the poses ``lefts`` see them."""
         args = {"lattice": dict(lattice), "T_bed_world": T_bed_world.to_list(), "rig": self.given}
         args["pairs"] = [T.to_list() for T in lefts]
         return Source("rille.datasets.mockup.truth_dem", NoParams(), args, inputs=self.inputs)
@@ -253,7 +252,7 @@ def vehicle_at_scale() -> Vehicle:
 
 
 def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -> Sequence:
-    """The sequence of a rover that is driven: one pair at the start, the others come about on the way."""
+    """The sequence of a driven rover: one pair at the start, others during the drive."""
     sources = Sources(true_rig(p), {})
     # The cameras stand 5 cm ahead of the centre of the wheels.
     T_vehicle_body = RigidTransform(np.eye(3), np.array([0.0, 0.05, p.camera_height]))
@@ -267,7 +266,7 @@ def mockup_loop(p: SetupParams, rover: RoverParams, name: str = "mockup-loop") -
 
     def image(frame: int, camera: str, T_bed_left: RigidTransform) -> Source:
         T_bed_camera = T_bed_left if camera == "left" else T_bed_left @ T_left_right
-        # Black but for the sensor's noise, as with a closed shutter.
+        # Black except for the sensor's noise, as with a closed shutter.
         lost = {"exposure": 1e-3} if frame in rover.lost_frames else {}
         return sources.image(frame, camera, T_bed_camera, p.part(RenderParams).model_copy(update=lost))
 

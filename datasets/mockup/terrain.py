@@ -1,7 +1,7 @@
-"""A seeded lunar bed: relief, craters, rocks, albedo grain and the light that falls on it.
+"""A seeded lunar bed: relief, craters, rocks, albedo grain and light.
 
 Lengths are metres of the bed (1:10). Arrays are [row, col], row 0 at the far end (greatest y). Every part draws from
-its own stream of the seed, so that changing one leaves the others as they were.
+its own stream of the seed, so that a change of one does not affect the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rille.datasets.mockup.params import SceneParams
 from rille.stages.core.arrays import Floats, Floats32
 
 OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
-"""Spacings of the relief's octaves, metres. Finer relief is drawn as grain: no camera resolves its shape."""
+"""Spacings of the relief's octaves, metres. Finer relief, which no camera resolves, is drawn as grain."""
 
 MIN_ROCK_M, MAX_ROCK_M = 0.004, 0.11
 MIN_CRATER_M, MAX_CRATER_M = 0.025, 0.35
@@ -26,15 +26,15 @@ NO_CEILING_M = -1e9  # m: the ceiling of the shade where there is none
 
 def stream(seed: int, part: int) -> np.random.Generator:
     """Generator of one part of the bed."""
-    # Parts in use: 1 to 40 here, 50 images, 60 to 62 motion and its sensors, 70 to 72 the rover. A new one takes a
-    # free number: a shared one would correlate what should be independent.
+    # Parts in use: 1 to 40 here, 50 images, 60 to 62 motion and its sensors, 70 to 72 the rover. A new part takes a
+    # free number, so that its draws are independent.
     return np.random.default_rng([seed, part])
 
 
 def add_octave(out: Floats32, spacing: float, amplitude: float, rng: np.random.Generator) -> None:
     """Add smooth noise of RMS ``amplitude`` to ``out``: a cubic B-spline, one random value each ``spacing`` nodes."""
     grid = rng.standard_normal([int(n / spacing) + 5 for n in out.shape], dtype=np.float32)
-    # Sparse, four weights a node: no BLAS sums their products, so that they are the same bits everywhere.
+    # Sparse, four weights per node: without BLAS, so that the bits are the same everywhere.
     rows, cols = (
         scipy.interpolate.BSpline.design_matrix(np.arange(n) / spacing, np.arange(-3.0, coefficients + 1), 3)
         for n, coefficients in zip(out.shape, grid.shape, strict=True)
@@ -58,7 +58,7 @@ def relief(p: SceneParams, shape: tuple[int, int]) -> Floats32:
 
 
 def _sizes(rng: np.random.Generator, count: float, least: float, most: float) -> NDArray[np.float64]:
-    """Diameters of a population with N(>D) ~ D^-2 between ``least`` and ``most``, in the order of placing."""
+    """Diameters of a population with N(>D) ~ D^-2 between ``least`` and ``most``, in order of their placement."""
     n = int(rng.poisson(count))
     u = rng.random(n)
     # The inverse of N(>D) ~ D^-2 cut off at both ends, so that uniform numbers give sizes.
@@ -82,10 +82,10 @@ def _patch(
 
 
 def add_craters(height: Floats32, p: SceneParams) -> None:
-    """Bowls with raised rims; the older a crater, the shallower. Ejecta fall off with distance^-3."""
+    """Add bowls with raised rims; older craters are shallower. Ejecta decrease with distance^-3."""
     rng = stream(p.seed, 1)
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
-    # The parameter counts those above 0.1 m: by D^-2 the number above the least one is larger by this factor.
+    # The parameter counts craters above 0.1 m; by D^-2 the number above the least size is larger by this factor.
     count = p.craters * area * (0.1 / MIN_CRATER_M) ** 2
     for diameter in _sizes(rng, count, MIN_CRATER_M, MAX_CRATER_M):
         *place, age = rng.random(3)
@@ -95,16 +95,16 @@ def add_craters(height: Floats32, p: SceneParams) -> None:
         rim = 0.22 * depth
         q = np.sqrt(dx**2 + dy**2) / (0.5 * diameter)
         inside = rim - (depth + rim) * (1.0 - q**2)
-        # Shifted and stretched to reach 0 at three radii, where the patch ends: a cut-off tail would leave a step.
+        # Shifted and stretched to reach 0 without a step at three radii, where the patch ends.
         outside = rim * (1.0 / np.maximum(q, 1.0) ** 3 - 1.0 / 27.0) / (1.0 - 1.0 / 27.0)
-        # a soft minimum of both rounds the rim over a tenth of the radius
+        # A soft minimum of both rounds the rim over a tenth of the radius.
         bowl = 0.5 * (inside + outside - np.sqrt((inside - outside) ** 2 + (0.1 * rim) ** 2))
         height[window] += np.where(q < 3.0, bowl, 0.0).astype(np.float32)
 
 
 class _Rock(NamedTuple):
-    """``diameter`` m of the long axis; ``aspect``, short over long; ``draws`` (5,) in 0..1 turn, break and tint it;
-    ``places``: shares of the bed's width and length, tried one after the other."""
+    """``diameter`` m of the long axis; ``aspect``, short over long; ``draws`` (5,) in 0..1 for turn, broken faces and
+    tint; ``places``: shares of the bed's width and length, tried one after the other."""
 
     diameter: float
     aspect: float
@@ -113,7 +113,7 @@ class _Rock(NamedTuple):
 
 
 def add_rocks(height: Floats32, p: SceneParams) -> Floats32:
-    """Put rocks of profile 1 - q^4 (bounded slopes) on the ground; returns their tint, the albedo relative to it."""
+    """Put rocks of profile 1 - q^4 (bounded slopes) on the ground; return their tint, the albedo relative to it."""
     area = (height.shape[0] * p.cell) * (height.shape[1] * p.cell)
     rough = np.zeros_like(height)  # relief of the rocks' faces relative to their height
     for k, wave in enumerate((0.016, 0.008, 0.004)):
@@ -134,9 +134,9 @@ def add_rocks(height: Floats32, p: SceneParams) -> Floats32:
 
 
 def _scattered(p: SceneParams, area: float) -> Iterator[_Rock]:
-    """Rocks anywhere, so many to a square metre; they may lie over each other."""
+    """Rocks at random positions, by number per square metre; they may overlap."""
     rng = stream(p.seed, 2)
-    # The parameter counts those above 30 mm.
+    # The parameter counts rocks above 30 mm.
     for diameter in _sizes(rng, p.rocks * area * (0.03 / MIN_ROCK_M) ** 2, MIN_ROCK_M, MAX_ROCK_M):
         x, y, turn, b, *others = rng.random(8)
         yield _Rock(diameter, 0.65 + 0.35 * b, np.array([turn, *others]), [np.array([x, y])])
@@ -155,7 +155,7 @@ def _beside_each_other(p: SceneParams, cover: float, area: float) -> Iterator[_R
 
 
 def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[np.float64]:
-    """Diameters, metres of the bed, falling, of rocks that together cover a share of an area (m2).
+    """Diameters, metres of the bed, decreasing, of rocks that together cover a share of an area (m2).
 
     The law is that of Golombek and Rapp (1997), doi:10.1029/96JE03319: the share under rocks wider than D metres falls
     with exp(-q D), q = 1.79 + 0.152 / cover, at full scale. Sizes are drawn one from each equal part of the numbers.
@@ -182,7 +182,7 @@ def _stone(dx: NDArray[np.float64], dy: NDArray[np.float64], rock: _Rock, rough:
     bearing = np.arctan2(v, u)
     outline = 1.0 + 0.10 * np.cos(3.0 * bearing + 6.3 * c) + 0.06 * np.cos(5.0 * bearing + 6.3 * e)
     q = np.sqrt(u**2 + v**2) / (0.5 * diameter * outline)
-    # tilted faces cut the body, as broken stones are; the profile bounds the slopes of what remains
+    # Tilted faces cut the body, as of broken stones; the profile bounds the other slopes.
     shape = 1.0 - q**4
     for k in range(3):
         way = 6.3 * g + 2.1 * k + c
@@ -194,8 +194,8 @@ def _stone(dx: NDArray[np.float64], dy: NDArray[np.float64], rock: _Rock, rough:
 def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:
     """Relative albedo, 128 = mean, uint8, on a grid of half the cell size (2 rows - 1, 2 cols - 1).
 
-    Grain in octaves from 33 mm down to a texel, 30-1000 cycles/m. What is finer than 8 mm stands for the shading of
-    relief that no camera resolves as well, and has twice the contrast.
+    Grain in octaves from 33 mm down to a texel, 30-1000 cycles/m. Grain finer than 8 mm also represents the shading of
+    relief that no camera resolves, and has twice the contrast.
     """
     shape = (2 * nodes[0] - 1, 2 * nodes[1] - 1)
     texel = 0.5 * p.cell
@@ -204,7 +204,7 @@ def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:
         if wave >= 2.0 * texel:
             add_octave(log, wave / texel, p.grain * (2.0 if wave < 0.008 else 1.0), stream(p.seed, 30 + k))
     log += np.float32(2.0 * p.grain) * stream(p.seed, 40).standard_normal(shape, dtype=np.float32)
-    # Log-normal: contrasts of the octaves multiply, and no albedo is negative.
+    # Log-normal: contrasts of the octaves multiply, and albedos are positive.
     return np.clip(128.0 * np.exp(log) + np.float32(0.5), 1, 255).astype(np.uint8)
 
 
@@ -219,7 +219,7 @@ def halve(a: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     """Share of the sun's disc that each node sees, 0..255 (cast shadows only, not the slope's own).
 
-    Sixteen points of the disc each cast a sharp shadow; together their edges are the wider the farther they fall.
+    Sixteen points of the disc each cast a sharp shadow; together these have edges that widen with distance.
     """
     points = 16
     count = np.zeros(height.shape, np.uint8)
@@ -231,7 +231,7 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
         elevation = np.deg2rad(np.clip(p.sun_elevation_deg + radius * np.sin(angle), 0.5, 89.5))
         # An angle on the sky spans more azimuth the higher it stands.
         azimuth = np.deg2rad(p.sun_azimuth_deg) + np.deg2rad(radius * np.cos(angle)) / np.cos(elevation)
-        # travel of the light in nodes: away from the sun; rows grow towards the viewer
+        # Direction of the light in nodes: away from the sun; rows increase towards the viewer.
         step_r, step_c = np.cos(azimuth), -np.sin(azimuth)
         longer = max(abs(step_c), abs(step_r))
         step_r, step_c = step_r / longer, step_c / longer
@@ -247,10 +247,10 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
 
 
 def _count_lit(height: Floats32, out: NDArray[np.uint8], across: float, phase: float, drop: float) -> None:
-    """Add one to ``out`` where light arrives that moves on by (1, ``across``) nodes and falls by ``drop`` metres.
+    """Add one to ``out`` where light arrives, which moves by (1, ``across``) nodes and descends by ``drop`` metres.
 
     The ceiling of the shade is swept along the rows, S(p) = max(h(q), S(q)) - drop at the node's predecessor q; along
-    a row the line is rounded to nodes, since interpolation would wear narrow shadows off.
+    a row the line is rounded to nodes, since interpolation would erode narrow shadows.
     """
     width = height.shape[1]
     shade = np.full(width, NO_CEILING_M)

@@ -18,7 +18,7 @@ SEEN, HIDDEN, OUTSIDE, NO_BED = 0, 1, 2, 3
 def visible(
     field: HeightField, camera: Camera, T_bed_camera: RigidTransform, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Where a camera sees points of the surface.
+    """Pixels of surface points in a camera, and whether it sees them.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ def visible(
     directions = points[inside] - T_bed_camera.translation
     t = field.contact(T_bed_camera.translation[None, :], directions)
     length = np.sqrt((directions**2).sum(axis=1))
-    # a ray that just misses the point it aims at has grazed it: seen; one that comes in through the bed's side: hidden
-    # A line of sight that ends this far in front of a point, in metres, hides it; far below any truth's use.
+    # A ray that just misses its point has grazed it: seen; one that comes in through the bed's side: hidden.
+    # 1e-5 m: a point is hidden if its line of sight ends farther in front of it; far below the accuracy of any use.
     free[inside] = ~((1.0 - t) * length > 1e-5)
     return pixels, inside, free
 
@@ -50,7 +50,7 @@ def true_disparity(field: HeightField, rig: Rig, T_bed_left: RigidTransform) -> 
     Returns
     -------
     column_disparity, row_disparity : float32 (row, col), pixels, right minus left; NaN where the left camera sees no
-        bed. Given for points that the right camera does not see, too.
+        bed. Also for points that the right camera does not see.
     occluded : uint8; 0 both cameras see the point, 1 hidden from the right one, 2 outside its image, 3 no bed.
     depth : float32, metres along the left optical axis, NaN without bed.
     """
@@ -61,7 +61,7 @@ def true_disparity(field: HeightField, rig: Rig, T_bed_left: RigidTransform) -> 
     shape = (rig.left.height, rig.left.width)
     rows, columns = np.indices(shape)
     occluded = np.full(len(rays), SEEN, np.uint8)
-    # Later lines win: what is outside of the right image was never tested for being hidden, and without bed nothing is.
+    # Later lines override: points outside of the right image have not been tested for being hidden.
     occluded[~free] = HIDDEN
     occluded[~inside] = OUTSIDE
     occluded[np.isnan(depth)] = NO_BED

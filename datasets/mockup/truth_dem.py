@@ -21,7 +21,7 @@ from rille.stages.geometry.geometry import Rig, RigidTransform
 def true_dem(
     field: HeightField, lattice: Mapping[str, Any], T_bed_world: RigidTransform
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Elevations at the cell centres of a lattice: where the world's own vertical line meets the bed from above.
+    """Elevations at the cell centres of a lattice, where vertical lines of the world frame meet the bed from above.
 
     Parameters
     ----------
@@ -79,6 +79,6 @@ def truth_dem_stage(
     elevation, points = true_dem(field, lattice, T_bed_world)
     lefts = [RigidTransform.from_matrix(m) for m in pairs]
     seen = seen_by(field, rig, lefts, points).reshape(elevation.shape).astype(np.uint8)
-    # Rounding may lift the cosine of a level frame above 1.
+    # Rounding may make the cosine of a level frame exceed 1.
     tilt = math.degrees(math.acos(min(1.0, T_bed_world.rotation[2, 2])))
     return Bundle({"elevation": elevation, "seen": seen}, {"lattice": dict(lattice), "tilt_deg": tilt})

@@ -1,1 +1,1 @@
-"""Text files that are read with care: bounded, checked, and named in every complaint."""
+"""Readers of text files: bounded, checked, with the file's name in every error."""

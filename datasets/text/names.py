@@ -1,4 +1,4 @@
-"""Names of sequences: they become folders, file names and keys of the cache, so that one rule holds for all of them."""
+"""Names of sequences, which become folders, file names and keys of the cache."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from rille.stages.core.errors import InputError
 MAX_CHARACTERS = 80
 
 NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{MAX_CHARACTERS - 1}}}")
-"""Never a path, a hidden file, an option or a control character, on no file system and in no bucket."""
+"""Names without paths, hidden files, options or control characters, on any file system and in any bucket."""
 
 OTHER = re.compile(r"[^A-Za-z0-9_.-]+")
 
 RESERVED = ("latest",)
-"""What the command line means otherwise."""
+"""Names with another meaning on the command line."""
 
 
 def check_name(name: str) -> None:
-    """Refuse what is no name of a sequence.
+    """Refuse an impossible name of a sequence.
 
     Raises
     ------
     InputError
-        It has other characters, is too long, or means something else.
+        It has other characters, is too long, or has another meaning.
     """
     if not NAME.fullmatch(name) or name in RESERVED:
         shown = repr(name if len(name) <= MAX_CHARACTERS else f"{name[:MAX_CHARACTERS]}...")
@@ -33,6 +33,6 @@ def check_name(name: str) -> None:
 
 
 def derived_name(text: str) -> str:
-    """A name made of that of a file or folder, whatever it has."""
+    """A name made from that of any file or folder."""
     name = OTHER.sub("_", text).strip("_.-")[:MAX_CHARACTERS].rstrip("_.-")
     return name if name and name not in RESERVED else "sequence"

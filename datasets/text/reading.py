@@ -1,7 +1,7 @@
-"""Files that others wrote, read within bounds: regular files up to a size, folders up to a number of entries.
+"""Read files of others within bounds: regular files up to a size, folders up to a number of entries.
 
-A pipe blocks for ever, a device never ends, and a short file may unpack or parse to something huge. Everything that is
-read of a sequence, a configuration or a calibration comes through here, so that each of these ends with one line.
+A pipe blocks for ever, a device never ends, and a short file may unpack or parse to something huge. All files of a
+sequence, a configuration or a calibration are read by this module, so that each of these ends with a message.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ TABLE = 100_000_000
 """Bytes of a table: an IMU at 200 Hz writes as much in three quarters of an hour."""
 
 MOST_LINES = 1_000_000
-"""Of a table; each becomes an object of some hundred bytes, and an IMU writes lines of a hundred characters."""
+"""Most lines of a table; each becomes an object of some hundred bytes, and an IMU's have a hundred characters."""
 
 LONGEST_LINE = 10_000
-"""Characters; a pose has 400. Parsers that look back take the square of it."""
+"""Characters; a pose has 400. Time of parsers that backtrack grows with the square."""
 
 DEEPEST = 20
 """Levels of nested entries; real files have four."""
 
 MOST_ENTRIES = 300_000
-"""Files and folders that are looked at in a search; a walk over them takes two or three seconds."""
+"""Most files and folders of a search, which takes two or three seconds for these."""
 
 GREATEST = 1e20
-"""Beyond any measurement in any unit: numbers below it can be squared, and multiplied, and stay finite."""
+"""Above any measurement in any unit; smaller numbers stay finite when squared and multiplied."""
 
 BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
 COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
@@ -50,10 +50,10 @@ LISTED = re.compile(r"\d,\d+,\s")
 """A number with a decimal comma in a list of numbers, between which there are blanks."""
 
 SAMPLE = 200
-"""Lines that show how a file writes its numbers."""
+"""Lines in which the form of a file's numbers is checked."""
 
 POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
-"""How files begin that Git LFS and git-annex left in place of their content."""
+"""Beginnings of files that Git LFS and git-annex leave in place of their content."""
 
 WILD = re.compile(r"[*?\[]")
 HIDDEN = re.compile(r"\.(?!\d+\.)")  # .25.png is a number
@@ -64,7 +64,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
 
     Parameters
     ----------
-    what : what the file is, for errors.
+    what : kind of the file, for errors.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            # Caught below, as the system's own refusals are: whatever the reason, it is one line.
+            # Caught below, with the system's own errors.
             raise OSError(0, "it is a folder" if stat.S_ISDIR(status.st_mode) else "it is a pipe or a device")
         if status.st_size <= most:
             file = path.open("rb")
@@ -94,17 +94,17 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
 
 
 def mark(status: os.stat_result) -> str:
-    """Inode, size and times of a file: they change with its content, for no call can set the time of change."""
+    """Inode, size and times of a file, which change with its content, since no call can set the time of change."""
     return f"{status.st_ino:x}.{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ctime_ns:x}"
 
 
 def is_broken(path: str | Path) -> bool:
-    """Whether a path is a link to something that is missing."""
+    """Whether a path is a link to a missing file."""
     return os.path.islink(path) and not os.path.exists(path)
 
 
 def is_file(path: str | Path) -> bool:
-    """Whether a path is a file, or a broken link: reading it says so."""
+    """Whether a path is a file, or a broken link, which is reported when it is read."""
     return os.path.isfile(path) or is_broken(path)
 
 
@@ -130,11 +130,11 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
     """
     data = read_bytes(path, what, most)
     try:
-        # As PowerShell's redirection and spreadsheets write it
+        # UTF-16: by PowerShell's redirection and by spreadsheets.
         text = data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
-        # No text, like a file with zero bytes: both are refused below.
+        # Refused below, like a file with zero bytes.
         text = "\0"
     if "\0" in text:
         remedy = next(iter(hints(path.name)), "give it as text in UTF-8")
@@ -143,7 +143,7 @@ def read_text(path: Path, what: str, most: int = SMALL) -> str:
 
 
 def read_lines(path: Path, what: str) -> list[str]:
-    """Lines of a table (see :func:`read_text`), of which there are no more than ``MOST_LINES``."""
+    """Lines of a table (see :func:`read_text`), at most ``MOST_LINES``."""
     text = read_text(path, what, TABLE)
     # Where ``str.splitlines`` ends a line
     # Counted before there is a list of them: empty lines cost nothing in the file.
@@ -170,12 +170,12 @@ def refuse_decimal_commas(lines: list[str], path: Path, cause: Exception | None 
         It is so.
     """
     if "".join(lines[:SAMPLE]).lstrip().startswith("{"):
-        return  # of JSON, whose commas part numbers, with or without a blank
+        return  # JSON, whose commas separate numbers, with or without a blank
     sample = enumerate((line[:LONGEST_LINE] for line in lines[:SAMPLE]), start=1)
     words = [(k, word) for k, line in sample for word in BETWEEN.split(line)]
     commas = [(k, word) for k, word in words if COMMA.fullmatch(word)]
     points = sum(POINT.search(word) is not None for _, word in words)
-    # In a list of YAML, of which each number has become two.
+    # In a list of YAML each such number has become two.
     counted = "numbers, it takes" in str(cause) and any(LISTED.search(line) for line in lines[:SAMPLE])
     if len(commas) > points or (counted and commas) or any(word in str(cause) for _, word in commas):
         text = f"{path}: decimal commas, such as {commas[0][1]} in line {commas[0][0]}, are not read"
@@ -203,7 +203,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def check_depth(value: Any, file: str) -> None:
-    """Refuse entries that are nested more than ``DEEPEST`` levels: whatever walks them would run out of stack."""
+    """Refuse entries of more than ``DEEPEST`` levels, by which recursion would run out of stack."""
     level = [value]
     for _ in range(DEEPEST):
         nested = [v.values() if isinstance(v, dict) else v for v in level if isinstance(v, dict | list)]
@@ -221,23 +221,23 @@ def _no_long_line(lines: list[str], path: Path, what: str) -> None:
 
 
 class Search:
-    """Looks into folders, at no more than ``MOST_ENTRIES`` files and folders in all.
+    """Search of folders, with at most ``MOST_ENTRIES`` files and folders in total.
 
     Attributes
     ----------
-    closed : a line on each folder that is there and could not be read.
+    closed : a line on each existing folder that could not be read.
     """
 
     def __init__(self) -> None:
         self._seen, self.closed = 0, list[str]()
 
     def entries(self, folder: Path) -> list[os.DirEntry[str]]:
-        """Entries of a folder in order of name; none where it cannot be read.
+        """Entries of a folder in order of name; empty if it cannot be read.
 
         Raises
         ------
         InputError
-            There are more than may be looked at.
+            There are too many.
         """
         found: list[os.DirEntry[str]] = []
         try:
@@ -245,7 +245,7 @@ class Search:
                 found = sorted(islice(there, MOST_ENTRIES - self._seen + 1), key=lambda entry: entry.name)
         except (FileNotFoundError, NotADirectoryError, ValueError):
             pass
-        except OSError as error:  # of another user, or on a network drive that is gone
+        except OSError as error:  # of another user, or on a disconnected network drive
             self.closed.append(f"folder {folder} cannot be read: {error.strerror}")
         self._seen += len(found)
         if self._seen > MOST_ENTRIES:
@@ -256,11 +256,11 @@ class Search:
     def below(
         self, top: Path, depth: int = MOST_ENTRIES, *, links: bool = False, hidden: bool = False
     ) -> Iterator[tuple[Path, list[os.DirEntry[str]]]]:
-        """The folder and those at most ``depth`` below it with their entries, each once.
+        """The folder and those at most ``depth`` levels below with their entries, each once.
 
         Parameters
         ----------
-        links : whether links are followed, which may lead back.
+        links : whether links are followed, which may form cycles.
         hidden : whether hidden folders and entries count.
         """
         level, entered = [top], {os.path.realpath(top)}
@@ -283,7 +283,7 @@ class Search:
         Raises
         ------
         InputError
-            The pattern is empty or absolute, or there is too much to look at.
+            The pattern is empty or absolute, or there are too many files.
         """
         *above, last = pattern.split("/")
         if not last or pattern.startswith("/"):
@@ -302,7 +302,7 @@ class Search:
         return [path for place in places for path in self._named(place, last) if is_file(path)]
 
     def _named(self, folder: Path, pattern: str) -> list[Path]:
-        """What a pattern names, of hidden ones (as macOS adds to archives) nothing unless it begins with a dot."""
+        """Entries that match a pattern; hidden ones (which macOS adds to archives) only if it begins with a dot."""
         entries = (e for e in self.entries(folder) if pattern.startswith(".") or not HIDDEN.match(e.name))
         return [Path(e.path) for e in entries if fnmatch.fnmatchcase(_folded(e.name), _folded(pattern))]
 

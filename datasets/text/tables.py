@@ -1,8 +1,8 @@
-"""Tables of numbers in text files, as sensors and other programs write them: cells as text, lines remembered.
+"""Tables of numbers in text files of sensors and other programs: cells as text, with line numbers.
 
-Columns are parted by commas, semicolons, tabs or blanks. The last line of words before the first row names the columns,
-with or without a leading ``#`` or ``%``, and one of units below it their units; later comments are passed over. A date
-and time of day at the beginning of a row is a number of seconds. A cell may be empty, which is no number.
+Columns are separated by commas, semicolons, tabs or blanks. The last line of words before the first row has the names
+of the columns, with or without a leading ``#`` or ``%``, and a line of units below it their units; later comments are
+skipped. A date and time of day at the beginning of a row is a number of seconds. Cells may be empty.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from rille.stages.core.errors import InputError
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
 STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
-"""How files begin that hold records of another form: GPX and KML are XML."""
+"""Beginnings of files with records of another form: GPX and KML are XML."""
 
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """Rows of equal length; ``header`` is empty where the file has no names, ``lines`` are the rows' line numbers."""
+    """Rows of equal length; ``header`` is empty if the file has no names, ``lines`` are the rows' line numbers."""
 
     name: str
     header: tuple[str, ...]
@@ -43,25 +43,25 @@ class TextTable:
 
     @property
     def columns(self) -> int:
-        """How many columns each row has."""
+        """Number of columns."""
         return len(self.rows[0])
 
     def unit(self, column: int) -> str:
-        """Unit that the name of a column states (:func:`unit_of`); empty: none."""
+        """Unit in the name of a column (:func:`unit_of`); empty: none."""
         return unit_of(self.header[column]) if self.header else ""
 
     def text(self, column: int) -> list[str]:
-        """One column as it is written: exact, where a float would lose the last digits of a time stamp."""
+        """One column as written: exact, while a float would lose the last digits of a time stamp."""
         return [row[column] for row in self.rows]
 
     def values(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Columns as numbers (rows, columns); NaN where nothing was measured, infinity where there is no number."""
+        """Columns as numbers (rows, columns); NaN for missing values, infinity for other texts."""
         return np.array([[_number(row[column]) for column in columns] for row in self.rows])
 
     def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, tuple[str, ...]]:
-        """The table without rows that say nothing in a column, or are ``lost``, and a warning that counts them.
+        """The table without rows that lack a value in a column, or are ``lost``, and a warning with their number.
 
-        Where no row is left, all are: whoever reads them says what is wrong.
+        If no row would be left, all are kept, and their reader reports the error.
         """
         missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | lost)
         if missing.all() or not missing.any():
@@ -75,7 +75,7 @@ class TextTable:
     def measures(
         self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None
     ) -> NDArray[np.float64]:
-        """Columns as :meth:`numbers`, times ``unit``, or by default times what the unit in a column's name is.
+        """Columns as :meth:`numbers`, times ``unit``, or by default times the unit in a column's name.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class TextTable:
         return self.numbers(columns) * factors
 
     def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
-        """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` rows may be NaN as a whole.
+        """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` whole rows may be NaN.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class TextTable:
 
 
 def _number(cell: str) -> float:
-    """Number of a cell; NaN of one that says nothing, infinity of any other text."""
+    """Number of a cell; NaN for a missing value, infinity for any other text."""
     try:
         return math.nan if cell.lower() in ("", "-", "na", "n/a", "null", "none") else float(cell)
     except ValueError:
@@ -138,12 +138,12 @@ def read_table(path: Path, what: str) -> TextTable:
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
     for k, line in enumerate(lines, start=1):
-        # Tabs at the end may part cells that are empty.
+        # Tabs at the end may separate empty cells.
         text = (undated(line) if DATE.match(line) else line).lstrip().rstrip(" ")
         if not text or (rows and text.startswith(("#", "%", "//"))):
             continue
         if not rows:
-            # Set anew by every line up to the first row, which decides: a comment above it may hold a comma.
+            # Set by every line up to the first row, which decides, since comments may hold commas.
             separator = next((s for s in ",;" if s in text), None)
             columns = len(split(names, separator or ("\t" if "\t" in names else None)))
         row = split(text, separator, columns)
@@ -172,9 +172,9 @@ def read_table(path: Path, what: str) -> TextTable:
 
 
 def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:
-    """Cells of a line without their quotes; a separator at its end makes no cell, unless that makes ``columns``.
+    """Cells of a line without quotes; a separator at the end adds a cell only if that makes ``columns`` cells.
 
-    Without a separator blanks part them, and tabs alone where that makes ``columns``.
+    Without a separator, cells are separated by blanks, or by tabs alone if that makes ``columns`` cells.
     """
     if separator is None and len(text.split()) != columns == text.count("\t") + 1:
         separator = "\t"

@@ -1,7 +1,7 @@
 """Time stamps of images and sensors: their unit and their order.
 
-Stamps since 1970 tell their unit by magnitude: 1.4e9 are seconds, 1.4e12 milliseconds, 1.4e15 microseconds and 1.4e18
-nanoseconds. Smaller ones count from some other start; they are taken for seconds unless the unit is stated.
+The magnitude of stamps since 1970 shows their unit: 1.4e9 are seconds, 1.4e12 milliseconds, 1.4e15 microseconds and
+1.4e18 nanoseconds. Smaller ones count from another start; they are seconds unless the unit is stated.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ import numpy as np
 from rille.stages.core.errors import InputError
 
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-"""How many of each make a second."""
+"""Number of each in a second."""
 
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
-"""Above it a value can no longer be in that unit: 1e11 s after 1970 is the year 5138."""
+"""Largest value in each unit: 1e11 s after 1970 is the year 5138."""
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d([-_/]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
     r"(?:\.(\d+)|[-_]?(\d{3}))?(Z|\+\d\d:?\d\d|-\d\d:\d\d| [-+]\d\d:?\d\d)?(?!\d)"
 )
-"""Date and time of day, with a fraction or milliseconds and a zone, as logs and names of files have them."""
+"""Date and time of day, with a fraction or milliseconds and a zone, as in logs and names of files."""
 
 
 def undated(text: str) -> str:
-    """The text with seconds since 1970 in the place of a date and time of day, for UTC where it has no zone."""
+    """The text with seconds since 1970 in place of a date and time of day, which is UTC without a zone."""
 
     def since(match: re.Match[str]) -> str:
         with suppress(ValueError):  # no day of a calendar
@@ -43,7 +43,7 @@ def undated(text: str) -> str:
 
 
 def of_two(whole: str, nanoseconds: str) -> str:
-    """Seconds of a stamp in two cells, as ROS has them; no number where they are none."""
+    """Seconds of a stamp in two cells, as of ROS; no number if these are none."""
     return f"{whole}.{nanoseconds:0>9}" if (whole + nanoseconds).isdecimal() else f"{whole} {nanoseconds}"
 
 
@@ -55,9 +55,9 @@ def seconds(
     Parameters
     ----------
     values : stamps as written (text and integers are divided exactly), in order.
-    what : what to call them in messages, usually the file.
+    what : name for messages, usually the file.
     unit : ``s``, ``ms``, ``us``, ``ns``, or ``auto``: by magnitude.
-    lines : line number of each stamp, for messages; counted from 1 where it is not given.
+    lines : line number of each stamp, for messages; by default from 1 on.
 
     Returns
     -------
@@ -83,8 +83,8 @@ def seconds(
             remedy = "put the rows in order of time, each once, in one unit and with all digits"
             raise InputError("RIL-293", text, remedy=remedy)
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
-    # s; stamps of 1973 and later are known by their magnitude. Pairs an hour apart are possible, but a wrong unit is
-    # likelier, and no camera takes ten million images a second.
+    # 1e8 s: stamps of 1973 and later have a known unit. 3600 s: a wrong unit is likelier than pairs an hour apart.
+    # 1e-7 s: no camera takes ten million images a second.
     if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
         text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
         likely = "ns" if usual > 1.0 else "s"
@@ -106,7 +106,7 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
 
 
 def _unit(exact: Sequence[Decimal], what: str, lines: Sequence[int]) -> str:
-    """The unit that all stamps have by their magnitude."""
+    """The common unit of all stamps by their magnitude."""
     units = [next((unit for unit, upper in UPPER.items() if abs(v) < upper), "ns") for v in exact]
     for k, unit in enumerate(units):
         if unit != units[0]:

@@ -1,4 +1,4 @@
-"""Units of measurement in the names of columns, and what they are in metres, radians and seconds."""
+"""Units of measurement in the names of columns, in metres, radians and seconds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORCES: Mapping[str, float] = {"m s": 1.0, "m s s": 1.0, "g": 9.80665, "mg": 9.8
 
 UNITS = frozenset(("", *LENGTHS, *ANGLES, "dps", "mdps", "g", "mg", "s", "ms", "us", "ns", "sec", "px", "%"))
 OPERATOR = re.compile(r"[-_/^*.\d \[\]()]+")
-"""Words of a row of units, and what stands between and about them: ``[m s^-2]``."""
+"""Separators of words in a row of units: ``[m s^-2]``."""
 
 SPELT = (
     ("deg", "deg(rees?|s)|\N{DEGREE SIGN}"),
@@ -33,7 +33,7 @@ SPELT = (
     ("in", "inch(es)?"),
     ("yd", "yards?"),
 )
-"""Symbols of units, and how else they are written."""
+"""Symbols of units, and their other spellings."""
 
 STATED = re.compile(
     r"[\[(](.*?)[\])]"
@@ -43,7 +43,7 @@ STATED = re.compile(
 
 
 def unit_of(name: str) -> str:
-    """Unit in the name of a column, its parts apart by blanks, without powers; empty: none that is known.
+    """Unit in the name of a column, its parts separated by blanks, without powers; empty: no known unit.
 
     >>> unit_of("gyro_x [rad s^-1]")
     'rad s'

@@ -1,4 +1,4 @@
-"""Values of the user's against a model: pydantic's complaints become one line with the dotted key and its neighbour."""
+"""Validate the user's values by a model: pydantic's errors become one line with the dotted key and its neighbour."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Model = TypeVar("Model", bound=Params)
 
 TAG = "("
 MEMBER = re.compile(r"[(\[]|literal\[|(constrained-)?(float|int|str)$|tuple\[")
-"""Begins the name of a member of a union, or of one without a name, which pydantic gives as if it were a key."""
+"""Beginning of names that pydantic gives to members of a union, or to unnamed types, as if they were keys."""
 
 
 def validated(
@@ -28,14 +28,14 @@ def validated(
     remedy: str = "",
     also: Iterable[str] = (),
 ) -> Model:
-    """``kind(**values)``, or one line that names each key that is wrong.
+    """``kind(**values)``, or an error of one line that names each wrong key.
 
     Parameters
     ----------
     code : of the error, ``RIL-223``.
     section : of the configuration, to which the keys belong.
-    file : that states the values, where a user wrote them into one.
-    also : sections that belong elsewhere, which a misspelt key may mean.
+    file : of the user with the values, if any.
+    also : other sections, which a misspelt key may mean.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def validated(
 
 
 def _complaint(error: Mapping[str, Any], section: str, known: list[str]) -> str:
-    """One of pydantic's complaints as dotted key, value and reason."""
+    """One of pydantic's errors as dotted key, value and reason."""
     first, *parts = map(str, error["loc"] or [""])
     key = section + ".".join([first, *(part for part in parts if not MEMBER.match(part))])
     if error["type"] == "extra_forbidden":
@@ -71,7 +71,7 @@ def _nearest(key: str, value: object, known: list[str]) -> str:
     if isinstance(value, Mapping) and value and last == table:
         return f"did you mean {table}.{next(iter(value))}?"
     beside = [k.rpartition(".")[2] for k in known if k.rpartition(".")[0] == table]
-    # A table alone means another one: stages and keys may share their names, as track of a stage and of a vehicle.
+    # A table can only mean a table: stages and keys may share names, as track of a stage and of a vehicle.
     others = () if isinstance(value, Mapping) else {k.rpartition(".")[0] for k in known}
     elsewhere = [k for k in known if k.rpartition(".")[2] == last and k not in others]
     meant = did_you_mean(elsewhere[0], elsewhere) if elsewhere else did_you_mean(last, beside, table + dot)

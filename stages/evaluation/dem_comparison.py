@@ -95,7 +95,8 @@ class Alignment:
 
 
 def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = RigidTransform.identity()) -> Alignment:
-    """Motion that aligns A with B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`).
+    """Motion that aligns A with B, by B's points on A (:mod:`rille.stages.terrain.relief.height_fit`), with the slopes
+    of B, the reference, which are known better.
 
     Parameters
     ----------
