@@ -198,9 +198,9 @@ def check_output(path: Path, *endings: str, option: str = "--output", others: Ma
         raise ConfigError("RIL-871", f"the output {path} has another ending", remedy=f"end it in {allowed}")
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        why = "may not be written" if above.is_dir() else "is no folder"
-        remedy = f"check its rights, or give another {option}"
-        raise ConfigError("RIL-746", f"the output {path} cannot be written: {above} {why}", remedy=remedy)
+        why, check = ("may not be written", "check its rights, or ") if above.is_dir() else ("is no folder", "")
+        text, remedy = f"the output {path} cannot be written: {above} {why}", f"{check}give another {option}"
+        raise ConfigError("RIL-746", text, remedy=remedy)
 
 
 def check_new(path: Path, but: str = "", remedy: str = "give another --output, or remove it") -> None:
