@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
@@ -222,7 +222,7 @@ def focus(coarse: Coarse) -> Coarse:
     # pixel matches.
     if less >= 0.85 * max(found) or more(4.0) >= 0:
         return coarse
-    blur = brentq(more, 0.0, 4.0, xtol=0.01)
+    blur = scipy.optimize.brentq(more, 0.0, 4.0, xtol=0.01)
     return replace(coarse, blur=(0.0, blur) if side else (blur, 0.0))
 
 

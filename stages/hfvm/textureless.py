@@ -32,9 +32,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import betainc
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.hfvm import epipolar, plane
@@ -303,7 +303,7 @@ def _sure(agree: AnyArray, votes: AnyArray, tried: AnyArray) -> bool:
     windows = votes.sum() ** 2 / np.sum(votes**2) / WINDOW_SIDE_PX**2
     # Binomial: the chance that as large a share of as many windows, or a larger one, agrees with one plane; the normal
     # distribution makes it far too small where windows are few.
-    tail = betainc(share * windows, (1.0 - share) * windows + 1.0, chance)
+    tail = scipy.special.betainc(share * windows, (1.0 - share) * windows + 1.0, chance)
     # 10**-5.5: of a range of 40 displacements at each of three corners there are some 10^5 different planes, and the
     # best one is taken. Of the chosen half right planes have at most 10^-5.7, wrong ones 10^-5.2 and more.
     return bool(tail < 10**-5.5)
