@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from inspect import getdoc
 from pathlib import Path
 
 import cv2
@@ -769,7 +770,7 @@ def test_every_key_is_described():
         f"{kind.__name__}.{key}"
         for kind in kinds
         for key, field in kind.model_fields.items()
-        if not tables(field.annotation) and not any(f"\n    {key} : " in str(base.__doc__) for base in kind.__mro__)
+        if not tables(field.annotation) and not any(f"\n{key} : " in (getdoc(base) or "") for base in kind.__mro__)
     }
     assert undescribed == set()
     assert {"rig.baseline", "cameras.left.fx", "vehicle.max_step", "times.rate_hz"} <= set(known_keys(Manifest))

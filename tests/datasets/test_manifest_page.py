@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ cameras and the rig are needed. `[cameras.left]` and `[cameras.right]` have the 
 `[cameras]`. Lengths are metres, and camera frames have x to the right, y down and z ahead, unless a key says
 otherwise. A key that is unknown is refused, and the error names the nearest one.
 """
-ENTRY = re.compile(r"^    (\w+) : (.*(?:\n        .*)*)", re.M)
+ENTRY = re.compile(r"^(\w+) : (.*(?:\n    .*)*)", re.M)
 
 
 def tables() -> dict[str, type[Params]]:
@@ -36,7 +37,7 @@ def meanings(model: type[Params]) -> dict[str, str]:
     """What each key means, by the documentation of the model and of its bases, or by its own description."""
     told = {name: field.description or "" for name, field in model.model_fields.items()}
     for base in reversed(model.__mro__):
-        told |= {name: " ".join(words.split()) for name, words in ENTRY.findall(base.__doc__ or "")}
+        told |= {name: " ".join(words.split()) for name, words in ENTRY.findall(inspect.cleandoc(base.__doc__ or ""))}
     return told
 
 

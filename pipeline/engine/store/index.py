@@ -86,7 +86,7 @@ class Index:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_INDEX_BYTES:
             raise ValueError(f"it is not a file of at most {MAX_INDEX_BYTES / 1e6:.0f} MB")
-        with closing(sqlite3.connect(f"{path.as_uri()}?mode={mode}", TIMEOUT_S, uri=True)) as database:
+        with closing(sqlite3.connect(f"{path.as_uri()}?mode={mode}", timeout=TIMEOUT_S, uri=True)) as database:
             database.execute("PRAGMA trusted_schema = OFF")
             if mode == "rw":
                 database.execute(f"CREATE TABLE IF NOT EXISTS {TABLE}")
