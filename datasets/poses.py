@@ -359,7 +359,7 @@ def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:
     if len(stated) != 1 or stated == {""}:
         names = " and ".join(table.header[place] for place in places) or "roll, pitch and yaw"
         text = f"{table.name}: the angles {names} have {'two units' if stated - {''} else 'no unit'}"
-        remedy = "write it behind their names, as yaw_deg or yaw_rad"
+        remedy = "write it after their names, as yaw_deg or yaw_rad"
         raise InputError("RIL-265", text, remedy=remedy)
     # Capitals: intrinsic rotations, yaw first, then pitch, then roll.
     turns = Rotation.from_euler("ZYX", values[:, ::-1])

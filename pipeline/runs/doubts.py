@@ -45,7 +45,7 @@ def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: boo
         yield explains_all
         return
     if result.unlike.blur:
-        which, other = ("right", "left") if result.unlike.blur > 0 else ("left", "right")
+        which, other = result.unlike.blurred
         text = f"the {which} image is blurred by {abs(result.unlike.blur):.1f} px beside the {other} one: out of focus?"
         yield warning("RIL-710", text)
     if closely:

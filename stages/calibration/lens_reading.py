@@ -57,7 +57,7 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
     both = {name: off({s: other[s].get(name, lenses[s]) for s in ideal}) for name in names}
     between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
     both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
-    name, least = min(both.items(), key=lambda item: item[1], default=("", given))
+    name, least = min(both.items(), key=lambda item: item[1])
     # Half of it: by chance no reading is so much better.
     if least > min(0.5 * given, 0.3):
         return ""

@@ -38,6 +38,11 @@ class Unlike(NamedTuple):
     aligned: bool = False
     blur: float = 0.0
 
+    @property
+    def blurred(self) -> tuple[str, str]:
+        """Side of the blurred image, and that of the sharper one; meaningless without blur."""
+        return ("right", "left") if self.blur > 0 else ("left", "right")
+
     def doubled(self) -> Unlike:
         """The same of images of twice the resolution."""
         return self._replace(blur=2 * self.blur)
