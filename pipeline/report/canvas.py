@@ -89,7 +89,6 @@ def _style() -> None:
             # Without it matplotlib draws random ids, and equal figures would be unequal files.
             "svg.hashsalt": "rille",
             "figure.facecolor": "none",
-            "savefig.bbox": "tight",
             "axes.facecolor": "none",
             "axes.grid": True,
             "axes.axisbelow": True,

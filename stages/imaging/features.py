@@ -106,10 +106,11 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
         return np.zeros((0, 2), np.uint32)
     # All descriptors have nearly the same length, so the greatest product is the least angle.
     products = a @ b.T
-    rows, nearest = np.arange(len(a)), products.argmax(axis=1)
+    nearest, rows = products.argmax(axis=1), np.arange(len(a))
     best = products[rows, nearest]
+    rows = np.flatnonzero(products.max(axis=0)[nearest] == best)
     # One for each column: the other of two equally near ones remains, and is the second best below.
-    rows = np.flatnonzero(products.argmax(axis=0)[nearest] == rows)
+    rows = np.sort(rows[np.unique(nearest[rows], return_index=True)[1]])
     nearest, best = nearest[rows], best[rows]
     # The largest remaining product is the second best of each row and column.
     products[rows, nearest] = 0.0

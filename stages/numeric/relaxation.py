@@ -74,22 +74,29 @@ def _sweep(field, across, down, goal, inverse, sweeps):  # type: ignore[no-untyp
     """Relax a field in place; it and the weights of the bends have a border.
 
     ``goal`` (rows, cols): power f_0 + pull; ``inverse``: 1 over all weights of a cell, 0 where it does not move.
+
+    A cell is the weighted mean of its goal and of the values by which each second difference vanishes, with the row
+    (its first end, second end and middle), then with the column. Of these only the two cells before it in its row are
+    moved just before. Everything else is therefore summed up for the whole row first, many cells at a time.
     """
     two, overshoot = np.float32(2.0), np.float32(OVERRELAXATION)
+    step = overshoot * inverse
+    stay = np.where(inverse > 0.0, np.float32(1.0) - overshoot, np.float32(1.0)).astype(np.float32)
+    rows, cols = goal.shape
+    before2 = step * across[BORDER:-BORDER, 1:-3]
+    before = two * (before2 + step * across[BORDER:-BORDER, 2:-2])
+    rest = np.empty(cols, np.float32)
     for _ in range(sweeps):
-        for r in range(goal.shape[0]):
+        for r in range(rows):
             i = r + BORDER
-            above, row, below = field[i - 1], field[i], field[i + 1]
-            for c in range(goal.shape[1]):
-                if not inverse[r, c] > 0.0:
-                    continue
+            above2, above, row, below, below2 = field[i - 2], field[i - 1], field[i], field[i + 1], field[i + 2]
+            bend, bend_above, bend_here, bend_below = across[i], down[i - 1], down[i], down[i + 1]
+            for c in range(cols):
                 j = c + BORDER
-                # Values of the cell by which the second differences along the row, then the column, vanish, times their
-                # weights: the cell is their second end, their first end and their middle.
-                total = across[i, j - 1] * (two * row[j - 1] - row[j - 2])
-                total += across[i, j + 1] * (two * row[j + 1] - row[j + 2])
-                total += two * across[i, j] * (row[j - 1] + row[j + 1])
-                total += down[i - 1, j] * (two * above[j] - field[i - 2, j])
-                total += down[i + 1, j] * (two * below[j] - field[i + 2, j])
-                total += two * down[i, j] * (above[j] + below[j])
-                row[j] += overshoot * (inverse[r, c] * (goal[r, c] + total) - row[j])
+                total = goal[r, c] + bend[j + 1] * (two * row[j + 1] - row[j + 2]) + two * bend[j] * row[j + 1]
+                total += bend_above[j] * (two * above[j] - above2[j]) + bend_below[j] * (two * below[j] - below2[j])
+                total += two * bend_here[j] * (above[j] + below[j])
+                rest[c] = stay[r, c] * row[j] + step[r, c] * total
+            for c in range(cols):
+                j = c + BORDER
+                row[j] = rest[c] - before2[r, c] * row[j - 2] + before[r, c] * row[j - 1]

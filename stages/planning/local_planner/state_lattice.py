@@ -16,9 +16,9 @@ from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.lattice import Lattice
@@ -120,7 +120,7 @@ class LatticeGraph:
             # degrees away.
             along = inside & (np.abs(off) < math.radians(25.0))
             on[k % HALF_TURN_HEADINGS, row[along], col[along]] = True
-        on = ndimage.binary_dilation(on, np.ones((1, 3, 3)))
+        on = scipy.ndimage.binary_dilation(on, np.ones((1, 3, 3)))
         for cost, known in zip((self.pose, self.step, self.turn), self.known, strict=True):
             cost[on] = np.minimum(cost[on], price)
             known[on] = True
