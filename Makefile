@@ -48,7 +48,9 @@ reconstruct: $(STAMP) ## a sequence to terrain, trajectory, risk map, path and r
 	@$(BIN)/rille reconstruct "$(SEQ)" $(if $(FRAMES),--frames $(FRAMES)) $(if $(JOBS),--jobs $(JOBS)) \
 	  $(foreach s,$(SET),--set '$(s)') $(ARGS)
 
-test: $(TOOLS) lint ## add all extras and the tools of the tests to .venv; lint, types and the test suite (a few minutes on two cores)
+test: $(TOOLS) ## add all extras and the tools of the tests to .venv; lint, types and the test suite (a few minutes on two cores)
+	@# Kernels are compiled on one core while lint and types take the other.
+	@$(BIN)/rille compile >/dev/null & $(MAKE) --no-print-directory lint && wait
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
 
 check: test torture ## everything, the slow checks too
