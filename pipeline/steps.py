@@ -289,8 +289,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     images, spread = (images, list[str]()) if "valid" in getattr(left, "coords", ()) else levelled(images)
     valid = [_valid(image) for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
-    how = tiles.how(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
-    disparity = match_pyramids(first, second, built.hfvm, how=how)
+    options = tiles.match_options(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
+    disparity = match_pyramids(first, second, built.hfvm, options=options)
     meta = facts(disparity.arrays, built.hfvm, disparity.unlike, int(np.count_nonzero(first.valid[0])))
     for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)

@@ -12,7 +12,7 @@ from rille.pipeline.engine.runtime.environment import cores
 from rille.stages.core.declare import Params
 from rille.stages.hfvm import coarse, matcher
 from rille.stages.hfvm.image import Shape, tiles
-from rille.stages.hfvm.matcher import How, Tell, silent
+from rille.stages.hfvm.matcher import MatchOptions, Tell, silent
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.tiles.join_stage import hfvm_join_stage
 from rille.stages.hfvm.tiles.tile_stage import hfvm_tile_stage
@@ -64,14 +64,14 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
     return chosen if chosen < max(*shapes[0], *shapes[1]) else None
 
 
-def how(
+def match_options(
     tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape], tell: Tell = silent
-) -> How:
-    """How one pair is matched by this process alone: by all of its cores, as far as memory permits."""
+) -> MatchOptions:
+    """Options of a match by this process alone: on all of its cores, as far as memory permits."""
     size = side(tiling, params, pyramid, shapes)
     # Both directions side by side, or as many tiles as fit.
     most = 2 if size is None else int(memory.free() / (tiling.memory * 1e6))
-    return How(tell, size, max(1, min(cores(), most)))
+    return MatchOptions(tell, size, max(1, min(cores(), most)))
 
 
 def _half(params: HfvmParams) -> int:

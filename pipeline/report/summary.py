@@ -25,7 +25,7 @@ from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
-from rille.stages.hfvm.coarse import Unlike
+from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.odometry.resection.intrinsics import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.reference import camera_height, seen_up
@@ -199,7 +199,7 @@ def _blurred(view: RunView) -> list[str]:
     blurs = [facts_of(view, handle).get("blur", 0.0) for handle in view.products.disparity.values()]
     # Of pairs of two sharp cameras some differ by chance.
     blur = float(np.median(blurs)) if blurs else 0.0
-    which, other = Unlike(blur=blur).blurred
+    which, other = ImageDifference(blur=blur).blurred
     text = (
         f"the {which} images are blurred by {abs(blur):.1f} px beside the {other} ones: out of focus, or a dirty lens?"
     )

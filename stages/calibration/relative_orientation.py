@@ -39,6 +39,7 @@ PARTNERS = ((NAMES.index("yaw"), 0), (NAMES.index("pitch"), 1))
 """Each angle with the coordinate of the principal point that has a similar effect."""
 
 MIN_MATCHES = 50
+"""Fewest matches of an orientation: ten for each of its five angles and directions."""
 
 BLOCKS = 6
 """Blocks along either side of the image; the scatter of their means shows how far errors of neighbours correlate."""

@@ -8,7 +8,7 @@ from rille.stages.core.declare import Facts
 class DisparityFacts(Facts):
     """``preset``; whether the right image was ``aligned`` by a plane; how many pixels are ``usable``, of these the
     share that is matched, and ``counts`` by reason; ``blur``, px, where the images differ by it
-    (``hfvm.coarse.Unlike``)."""
+    (``hfvm.coarse.ImageDifference``)."""
 
     preset: str
     aligned: bool

@@ -31,7 +31,7 @@ COARSE_LEVEL = 2
 """Level whose matches decide on brightness, alignment by a plane, and turned views."""
 
 
-class Unlike(NamedTuple):
+class ImageDifference(NamedTuple):
     """How the right image differs from the left one: whether it was ``aligned`` by a plane, and ``blur``, pixels: the
     standard deviation of the Gaussian that it is blurred by beside the left one; negative: the left one is."""
 
@@ -43,7 +43,7 @@ class Unlike(NamedTuple):
         """Side of the blurred image, and that of the sharper one; meaningless without blur."""
         return ("right", "left") if self.blur > 0 else ("left", "right")
 
-    def doubled(self) -> Unlike:
+    def doubled(self) -> ImageDifference:
         """The same of images of twice the resolution."""
         return self._replace(blur=2 * self.blur)
 
@@ -75,10 +75,10 @@ class Coarse:
         return 1.0 if self.alignment is None else plane.scale(self.alignment, self.images.left.shapes[0])
 
     @property
-    def unlike(self) -> Unlike:
+    def unlike(self) -> ImageDifference:
         """How the right image differs, for the user: without blur that follows from the scale."""
         left, right = (0.0, 0.0) if unlike_scale(self.scale) else self.blur
-        return Unlike(self.alignment is not None, left - right)
+        return ImageDifference(self.alignment is not None, left - right)
 
     @property
     def share(self) -> float:

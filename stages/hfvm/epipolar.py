@@ -53,6 +53,7 @@ def fit_points(
     F : (3, 3) float64 with ``(x + u, y + v, 1) F (x, y, 1)^T = 0`` in pixels of this level.
     spread : median distance of the matches from their lines, pixels.
     """
+    # 40: five matches for each of the eight unknowns.
     if len(y) < 40:
         return None
     scale = 0.5 * max(left_shape)

@@ -25,7 +25,7 @@ from rille.stages.core.validity import Validity, matched
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, levelled, ratio_of_matches
-from rille.stages.hfvm.coarse import Unlike
+from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
 from rille.stages.hfvm.image import Shape, as_matched
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
@@ -114,4 +114,4 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
         # Where a map of it says nothing the estimate stays.
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)
         arrays["disparity_std"] = np.where(stated, given["disparity_std"], arrays["disparity_std"])
-    return Bundle(arrays, facts(arrays, params, Unlike(), int(np.count_nonzero(a.valid[0]))))
+    return Bundle(arrays, facts(arrays, params, ImageDifference(), int(np.count_nonzero(a.valid[0]))))

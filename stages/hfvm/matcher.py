@@ -14,7 +14,7 @@ from numba import njit
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
-from rille.stages.hfvm.coarse import Unlike
+from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.hfvm.image import as_matched, whole
 from rille.stages.hfvm.image import tiles as cut
 from rille.stages.hfvm.level import PyramidPair, Recipe
@@ -129,7 +129,7 @@ def silent(share: float, step: str) -> None:
     """Report no progress."""
 
 
-class How(NamedTuple):
+class MatchOptions(NamedTuple):
     """Options of a match besides its parameters: progress callback ``tell``; ``side`` of a tile, pixels (None: whole
     images); number of ``threads``, which changes no bit of the result."""
 
@@ -141,26 +141,26 @@ class How(NamedTuple):
 Arrays = dict[str, AnyArray]
 
 
-def match(left: Pyramid, right: Pyramid, params: HfvmParams, how: How) -> tuple[Arrays, Unlike]:
+def match(left: Pyramid, right: Pyramid, params: HfvmParams, options: MatchOptions) -> tuple[Arrays, ImageDifference]:
     """Dense displacements from the left image to the right one (4.3), step by step.
 
     Arrays of :class:`rille.stages.hfvm.stage.StereoMatches` by name, and how the right image differs.
     """
     if halves(params, left.levels, right.levels):
-        half, unlike = match(left.above(1), right.above(1), halved(params), how)
+        half, unlike = match(left.above(1), right.above(1), halved(params), options)
         return doubled(half, left.valid[0], right.shape, (0, 0)), unlike.doubled()
-    how.tell(0.0, "coarse levels")
+    options.tell(0.0, "coarse levels")
     pyramids = as_matched(left, params), as_matched(right, params)
-    images = PyramidPair(*pyramids, params, RECIPES[params.preset], how.threads)
+    images = PyramidPair(*pyramids, params, RECIPES[params.preset], options.threads)
     pair = coarse.match_coarse_levels(images)  # 4.3.1 features; 4.3.4 hierarchy; brightness, alignment
-    how.tell(0.15, "fine levels")
-    side = how.side if local(params) and images.levels > 1 else None
+    options.tell(0.15, "fine levels")
+    side = options.side if local(params) and images.levels > 1 else None
     windows = [whole(left.shape)] if side is None else cut(left.shape, side)
     # Threads take a window each, or both directions of the only one.
-    pair = pair.with_threads(how.threads if len(windows) == 1 else 1)
+    pair = pair.with_threads(options.threads if len(windows) == 1 else 1)
     fine = {w: partial(finest.match_finest_level, pair, w) for w in windows}  # 4.3.4, 4.3.2, 4.3.3
-    matches = finest.put_together(fine, left.shape, how.threads)
-    how.tell(0.9, "filling")
+    matches = finest.put_together(fine, left.shape, options.threads)
+    options.tell(0.9, "filling")
     ending = finest.fit_lines_and_planes(pair, matches)
     final = {w: partial(finest.interpolate_undefined, pair, w, matches, ending) for w in windows}  # 4.3.4
-    return finest.put_together(final, left.shape, how.threads), pair.unlike
+    return finest.put_together(final, left.shape, options.threads), pair.unlike

@@ -25,8 +25,8 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
 from rille.stages.core.validity import Mask, counts
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper
-from rille.stages.hfvm.coarse import Unlike
-from rille.stages.hfvm.matcher import WHOLE, How
+from rille.stages.hfvm.coarse import ImageDifference
+from rille.stages.hfvm.matcher import WHOLE, MatchOptions
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid, PyramidParams
@@ -35,7 +35,7 @@ __all__ = ["OUTPUTS", "HfvmParams", "StereoMatches", "facts", "hfvm_stage", "mat
 
 Map = NDArray[np.float32]
 
-HOW = How()
+DEFAULT = MatchOptions()
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class StereoMatches:
     backmatch_error: Map
     distance: Map
     disparity_std: Map
-    unlike: Unlike
+    unlike: ImageDifference
 
     @property
     def arrays(self) -> dict[str, AnyArray]:
@@ -72,7 +72,7 @@ def match(
     params: HfvmParams | None = None,
     *,
     valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
-    how: How = HOW,
+    options: MatchOptions = DEFAULT,
 ) -> StereoMatches:
     """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
 
@@ -81,7 +81,7 @@ def match(
     left, right : (row, col) grey images, uint8, uint16 or floating point 0..255; sizes may differ.
     params : matcher's parameters; None: preset ``default``.
     valid : of the left and the right image (row, col), not zero where usable; None: everywhere.
-    how : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
+    options : progress, tiles, threads. Tiles need less memory; all but a thousandth of the pixels are within .01 px.
         Presets ``accurate`` and ``paper`` are matched whole.
 
     Raises
@@ -96,19 +96,19 @@ def match(
     """
     levels = PyramidParams()
     a, b = (pyramid.build(image, levels, usable) for image, usable in zip((left, right), valid, strict=True))
-    return match_pyramids(a, b, params or HfvmParams(), how)
+    return match_pyramids(a, b, params or HfvmParams(), options)
 
 
-def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams, how: How = HOW) -> StereoMatches:
+def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams, options: MatchOptions = DEFAULT) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
-        arrays, unlike = paper.match(left, right, params, how.tell), Unlike()
+        arrays, unlike = paper.match(left, right, params, options.tell), ImageDifference()
     else:
-        arrays, unlike = matcher.match(left, right, params, how)
+        arrays, unlike = matcher.match(left, right, params, options)
     return StereoMatches(**arrays, unlike=unlike)
 
 
-def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, unlike: Unlike, usable: int) -> DisparityFacts:
+def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, unlike: ImageDifference, usable: int) -> DisparityFacts:
     """Facts of disparities; ``usable``: how many pixels of the left image are."""
     bits = counts(arrays["validity"])
     found: DisparityFacts = {

@@ -18,7 +18,7 @@ class Equations(Protocol):
 
     @property
     def cost(self) -> float:
-        """Half the weighted sum of squares, or of the robust loss."""
+        """Weighted sum of squares, or robust loss, times any constant: costs are only compared."""
         ...
 
 

@@ -104,6 +104,7 @@ def fit_plane(samples: Samples, allowed: Callable[[Floats], Bools]) -> GroundPla
 
 
 MIN_POINTS = 100
+"""Fewest points among which a plane is looked for."""
 MIN_HORIZON_SIGMAS = 5.0  # an inverse depth of fewer of its sigmas agrees with any plane, and is not counted
 
 

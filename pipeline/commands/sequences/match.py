@@ -98,8 +98,8 @@ def match(
 
     shapes = images[0].shape, images[1].shape
     with _progress(max(image.size for image in images)) as tell:
-        how = tiles.how(tiles.Tiling(), params, PyramidParams(), shapes, tell)
-        result = hfvm.match(images[0], images[1], params, how=how)
+        options = tiles.match_options(tiles.Tiling(), params, PyramidParams(), shapes, tell)
+        result = hfvm.match(images[0], images[1], params, options=options)
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
     column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}

@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.stages.core.declare import AnyArray, Bundle, stage
 from rille.stages.facts.matching import DisparityFacts, TileFacts
-from rille.stages.hfvm.coarse import Unlike
+from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.hfvm.image import Window, whole
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
@@ -49,5 +49,5 @@ def hfvm_join_stage(
     windows = [w.child(shape) for w in task.windows] if task.half else task.windows
     arrays = Joined(tiles, windows, shape)
     usable = int(np.count_nonzero(mask[whole(shape).slices]))
-    unlike = Unlike(*coarse.meta["unlike"])
+    unlike = ImageDifference(*coarse.meta["unlike"])
     return Bundle(arrays, facts(arrays, params, unlike.doubled() if task.half else unlike, usable))

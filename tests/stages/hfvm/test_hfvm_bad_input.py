@@ -8,7 +8,7 @@ from matching_scenes import pair, seen
 from rille.stages.core.errors import InputError
 from rille.stages.core.validity import Validity, defined, has, matched
 from rille.stages.hfvm.finest import isolated
-from rille.stages.hfvm.matcher import How
+from rille.stages.hfvm.matcher import MatchOptions
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 
@@ -144,7 +144,7 @@ def test_patches_of_chance_go_where_nearly_all_are_small_and_stay_beside_a_large
 def test_progress_grows_from_nothing_to_all():
     left, right, *_ = pair(lambda x, y: (-5.0, 0.0))
     told = []
-    match(left, right, how=How(lambda share, step: told.append((share, step))))
+    match(left, right, options=MatchOptions(lambda share, step: told.append((share, step))))
     shares = [share for share, _ in told]
     assert shares[0] == 0
     assert shares == sorted(shares)

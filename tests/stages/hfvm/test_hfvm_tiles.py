@@ -7,7 +7,7 @@ from matching_scenes import pair
 
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.image import Window, as_matched, thinned, tiles, whole
-from rille.stages.hfvm.matcher import How, local
+from rille.stages.hfvm.matcher import MatchOptions, local
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.imaging.pyramid import PyramidParams, build
@@ -61,7 +61,7 @@ def unfocused():
 def test_tiles_are_within_a_hundredth_of_a_pixel_of_the_whole(scene, aligned, preset):
     left, right = scene()
     params = HfvmParams(preset=preset)
-    once, cut = match(left, right, params), match(left, right, params, how=How(side=160))
+    once, cut = match(left, right, params), match(left, right, params, options=MatchOptions(side=160))
     assert once.unlike.aligned == cut.unlike.aligned == aligned
     assert matched(once.validity).mean() > 0.5
     a, b = (np.stack([found.column_disparity, found.row_disparity]) for found in (once, cut))
@@ -78,7 +78,7 @@ def test_presets_that_reach_over_the_image_are_matched_whole():
 @pytest.mark.parametrize("side", [None, 160])
 def test_threads_change_no_bit(side):
     left, right = misaligned()
-    one, three = (match(left, right, how=How(side=side, threads=n)) for n in (1, 3))
+    one, three = (match(left, right, options=MatchOptions(side=side, threads=n)) for n in (1, 3))
     for name, values in vars(one).items():
         np.testing.assert_array_equal(values, getattr(three, name))
 

@@ -7,7 +7,7 @@ import pytest
 from rille.stages.core.validity import matched
 from rille.stages.hfvm import epipolar, textureless
 from rille.stages.hfvm.image import Window, pack, whole
-from rille.stages.hfvm.matcher import How
+from rille.stages.hfvm.matcher import MatchOptions
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match
 from rille.stages.hfvm.textureless import MIN_DISTINCT_STEPS, WINDOW_SIDE_PX, Planes, Region, search
@@ -87,7 +87,7 @@ def test_a_wall_whose_displacement_is_beyond_all_that_is_searched_is_left_alone(
 
 def test_tiles_have_the_planes_of_the_whole():
     left, right, _, wall = scene(tilt=0.02)
-    once, tiles = (match(left, right, how=How(side=side)) for side in (None, 77))
+    once, tiles = (match(left, right, options=MatchOptions(side=side)) for side in (None, 77))
     assert np.mean(matched(once.validity) == matched(tiles.validity)) > 0.99
     both = matched(once.validity) & matched(tiles.validity) & wall
     assert both[wall].mean() > 0.5
