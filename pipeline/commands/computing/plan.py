@@ -26,7 +26,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
+from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 
 
@@ -35,7 +35,7 @@ def plan(
     *,
     options: Work = Work(),
     verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
-) -> int:
+) -> None:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
 
     Parameters
@@ -68,7 +68,6 @@ def plan(
     # The refusal comes last, after the table with its task.
     for line in chain(describe(graph, result, workers, verbose=verbose), needs(planned, budget)):
         print(line)
-    return COMPLETE
 
 
 def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterable[str]:
@@ -133,7 +132,7 @@ def _unknown(result: Result) -> Iterable[str]:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
 
 
-def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
+def graph(seq: str = "mockup", *, options: Settings = Settings()) -> None:
     """Draw the stages of a run, the number of their tasks, and what each reads.
 
     What depends on results that are still to come is drawn as the last run had it; where there was none, the title says
@@ -151,7 +150,6 @@ def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
     result = run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True))
     result.check()
     print(dot(laid_out, result))
-    return COMPLETE
 
 
 def dot(graph: Graph, result: Result) -> str:
