@@ -371,13 +371,6 @@ def basic_pairs(
     return Choice(which, chosen, basic, known, judged, suspects)
 
 
-def compare_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
-    """Compare suspect pairs, 12 at most, with right images of other times."""
-    asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
-    make.products.contradictions.append(asked)
-    return (yield from done(asked))
-
-
 def misfits(choice: Choice, mode: str) -> set[int]:
     """Pairs that do not fit the rig though their neighbours do; none if many do not: these bend the rig itself."""
     basic, facts = choice.basic, [rig.meta.get("per_pair", ()) for rig in choice.judged]
@@ -418,7 +411,9 @@ def simultaneous(
             p.contradictions.append(synchrony_of_late(make, late, whole))
         choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
         if choice.suspects:
-            apart = yield from compare_times(make, choice, chain)
+            # Suspect pairs, 12 at most, are compared with right images of other times.
+            p.contradictions.append(make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain))
+            apart: Ref[SynchronyFacts] = yield p.contradictions[-1]
             partners = apart.meta["partners"]
             if partners and not timed:
                 # All frames, not basic pairs alone: after a lost image no pair is of one time.
@@ -533,14 +528,9 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
 
 
 def vertical(make: Builder, pair: int) -> dict[str, Any]:
-    """Collect the known facts about the vertical of a pair (attitude, pitch) as arguments of a stage."""
-    s, args = make.sequence, dict[str, Any]()
-    up = None if s.up is None else s.up[pair]
-    if up is not None:
-        args["up"] = list(up)
-    if s.pitch is not None:
-        args["pitch"] = s.pitch
-    return args
+    """The facts about the vertical of a pair (attitude, pitch) as arguments of a stage, None where not known."""
+    up = make.sequence.up and make.sequence.up[pair]
+    return {"up": up and list(up), "pitch": make.sequence.pitch}
 
 
 def refuse_knocked(
@@ -581,9 +571,9 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
     said: dict[str, Any] = {name: dict(fact) for name, fact in s.priors.items()}
     rows = {"odometry": ("poses", s.odometry), "attitude": ("rotations", s.attitude), "up": ("directions", s.up)}
     for name, (key, known) in rows.items():
-        if name in said and known is None:
-            del said[name]
-        elif name in said and known is not None:
+        if known is None:
+            said.pop(name, None)
+        elif name in said:
             one = [known[f] for f in frames]
             said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
     times = list(frames) if s.times is None else [s.times[f] for f in frames]
