@@ -114,7 +114,10 @@ class Store:
                 # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares
                 # what was touched
                 if use and status.st_mtime < time.time() - 3600.0:
-                    folder.touch(path)
+                    with suppress(
+                        OSError
+                    ):  # by such rights nobody clears it up; if it has just gone, its reader says so
+                        os.utime(path)
                 return known or manifest.reference(self.read_manifest(stage, key), status.st_size)
         except FileNotFoundError:
             return None
