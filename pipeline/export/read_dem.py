@@ -36,8 +36,6 @@ MAX_CELLS = 500_000_000
 
 OURS = "give a run as Rille writes it"
 
-NO_PLACE = "give a raster that says itself where its cells are"
-
 TIFF = (b"II", b"MM")
 """First bytes of a TIFF; any other file is read as an ESRI ASCII grid."""
 
@@ -245,7 +243,8 @@ def _check_cells(path: Path, shape: tuple[int, ...]) -> None:
 def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
     """WKT of the CRS of a raster, empty if it states none."""
     if transform == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+        remedy = "give a raster that says itself where its cells are"
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=remedy)
     if crs is None:
         return ""
     if crs.is_geographic:
@@ -255,8 +254,7 @@ def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
-    wkt: str = crs.to_wkt(version="WKT2_2019")
-    return wkt
+    return str(crs.to_wkt(version="WKT2_2019"))
 
 
 def crs_name(wkt: str) -> str:
@@ -311,7 +309,8 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
     # Read outside of the try: an unreadable file is an error, while one with other content just has no cameras.
-    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run / "frames.json")
+    lines = read_lines(run / "trajectory.kitti", "trajectory")
+    frames = read_text(run / "frames.json", "frames.json", TABLE)
     try:
         poses, place = np.loadtxt(lines, ndmin=2), georeference_in(json.loads(frames))
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
@@ -322,11 +321,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 def frames_of(path: Path) -> dict[str, Any]:
     """Content of a run's ``frames.json``; empty if there is none."""
-    return dict(json.loads(_frames(path))) if path.exists() else {}
-
-
-def _frames(path: Path) -> str:
-    return read_text(path, "frames.json", TABLE)
+    return dict(json.loads(read_text(path, "frames.json", TABLE))) if path.exists() else {}
 
 
 def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
