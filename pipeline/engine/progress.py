@@ -35,7 +35,7 @@ class Progress:
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
         self.graph: Graph | None = None
-        self.done = 0
+        self.done, self.shown = 0, time.monotonic()
 
     def open(self, graph: Graph) -> None:
         """The run of a graph begins; the graph may still grow."""
@@ -60,11 +60,6 @@ class Progress:
 
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
-
-    def open(self, graph: Graph) -> None:
-        """Begin the clock."""
-        super().open(graph)
-        self.shown = time.monotonic()
 
     def resolved(self, handle: Handle) -> None:
         """Say at once what was compiled, and show where the run is."""
@@ -93,17 +88,20 @@ class Lines(Progress):
 class Bar(Lines):
     """A bar of the tasks that have ended."""
 
-    def open(self, graph: Graph) -> None:
-        """Show the bar."""
+    def __init__(self, stream: TextIO | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
-        super().open(graph)
+        super().__init__(stream)
         columns = MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         named = TextColumn("{task.description}", markup=False)
         self.rich = RichProgress(*columns, named, console=Console(file=raw(self.stream)), transient=True)
         self.task = self.rich.add_task("", total=None)
+
+    def open(self, graph: Graph) -> None:
+        """Show the bar."""
+        super().open(graph)
         self.rich.start()
 
     def _show(self, handle: Handle) -> None:
@@ -111,13 +109,11 @@ class Bar(Lines):
 
     def close(self, result: Result) -> None:
         """Take the bar away."""
-        if hasattr(self, "rich"):
-            self.rich.stop()
+        self.rich.stop()
         super().close(result)
 
     def _say(self, text: str) -> None:
-        if hasattr(self, "rich"):
-            self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
+        self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def summary(result: Result) -> str:
