@@ -15,7 +15,7 @@ from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 from rille.stages.core.errors import ConfigError, RilleError
 
-Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
+Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2"]
 
 
 def export(
@@ -36,8 +36,7 @@ def export(
         laz (CloudCompare, PDAL, QGIS), ply (CloudCompare, MeshLab): every matched pixel as a point with its standard
         deviations; glb: the ground as a mesh, for any glTF viewer, Blender; frames: position, range, normal, slope,
         roughness and disparity of each pair as rasters of its left image; colmap: cameras, rig, poses and tracked
-        points; nav2: occupancy map of ROS 2's navigation; rocrate: an RO-Crate of all files with digests of results and
-        inputs, parameters, versions and the command, for archives; `rille reconstruct` runs it again. May be repeated.
+        points; nav2: occupancy map of ROS 2's navigation. May be repeated.
     output
         What to write, for one form only; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in
         the run's folder.
