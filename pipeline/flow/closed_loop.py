@@ -328,16 +328,14 @@ class Drive:
     def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
         """Plan the next leg; plan again while a way turns out to be closed."""
         known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
-        follows, label, thoughts = "again", f"leg/{stop.index}", 0
+        known |= {"before": self.planned, "driven": self.products.trajectory}
+        follows, thoughts = "again", 0
         while follows == "again":
-            driven = self.products.trajectory
-            stop.leg = self._leg(label, self.memory, {}, before=self.planned, driven=driven, **known)
+            label = f"leg/{stop.index}/{thoughts}" if thoughts else f"leg/{stop.index}"
+            stop.leg = self._leg(label, self.memory, {}, **known)
             leg = (yield stop.leg).meta
-            where = None if leg["where"] is None else tuple(leg["where"])
-            follows = self.memory.after(leg["verdict"], where)
-            if follows == "again":
-                thoughts += 1
-                label = f"leg/{stop.index}/{thoughts}"
+            follows = self.memory.after(leg["verdict"], leg["where"] and tuple(leg["where"]))
+            thoughts += 1
         if follows == "end":
             stop.event = leg["reason"]
             raise EndedError(leg["verdict"], leg["reason"])
