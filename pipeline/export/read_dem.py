@@ -330,35 +330,24 @@ def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
     return None if stated is None else Georeference.from_dict(stated)
 
 
-def refuse_irregular(top: Path) -> None:
-    """Refuse a file or folder of a run that is, or holds, a link, a pipe or a device.
-
-    Raises
-    ------
-    InputError
-        It does; Rille writes none, and the target of a link is no part of the run.
-    """
-    below = (Path(entry.path) for _, entries in Search().below(top, hidden=True) for entry in entries)
-    for path in (top, *below):
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise InputError("RIL-723", f"{path} is no regular file", remedy=OURS)
-
-
 def check_group(path: Path) -> None:
-    """Refuse a zarr group with larger axes or chunks than Rille writes, with other codecs, or with pipes.
+    """Refuse a zarr group with larger axes or chunks than Rille writes, with other codecs, or with links or pipes.
 
     Raises
     ------
     InputError
-        It has such an array, or one that might unpack to any size, or a file that is not regular, such as a pipe, for
-        which zarr would wait for ever.
+        It has such an array, or one that might unpack to any size, or a link, or a pipe, for which zarr would wait for
+        ever.
     ValueError, OSError, KeyError, TypeError
         It is no zarr group.
     """
     import zarr
     from zarr.storage import LocalStore
 
-    refuse_irregular(path)
+    # Rille writes none of these, and the target of a link is no part of the run.
+    for file in (path, *(Path(entry.path) for _, entries in Search().below(path, hidden=True) for entry in entries)):
+        if file.is_symlink() or not (file.is_file() or file.is_dir()):
+            raise InputError("RIL-723", f"{file} is no regular file", remedy=OURS)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
         # 10_000_000: longest axis, because coordinates are always read whole.
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:

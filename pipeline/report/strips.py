@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import artifacts
+from rille.pipeline.export.view import artifact
 from rille.pipeline.report import canvas, gather, ranges
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
@@ -102,8 +103,7 @@ def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[P
 
 def _pair(scene: Scene, pair: int, width: int) -> Panel:
     view = scene.view
-    bundle, image = view.bundle(view.products.disparity[pair]), artifacts.image(view, pair)
-    assert bundle is not None
+    bundle, image = artifact(view, view.products.disparity[pair]), artifacts.image(view, pair)
     band, sign = depth_band(view.sequence.rig)
     there = matched(np.asarray(bundle["validity"]))
     seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))
@@ -124,8 +124,7 @@ def _pair(scene: Scene, pair: int, width: int) -> Panel:
 
 def _stop(scene: Scene, stop: Stop, width: int) -> Panel:
     view, track = scene.view, scene.track
-    leg, image = view.bundle(stop.leg), view.bundle(view.products.images.get(stop.frame))
-    assert leg is not None
+    leg, image = artifact(view, stop.leg), view.bundle(view.products.images.get(stop.frame))
     risk = gather.terrain(view.bundle(stop.risk), "risk")
     dem = gather.terrain(view.bundle(stop.risk if stop.far is None else stop.far), "elevation")
     assert risk is not None

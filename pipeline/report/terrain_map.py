@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.pipeline.export import colour
+from rille.pipeline.export.view import artifact
 from rille.pipeline.report import canvas, gather, ranges, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
@@ -171,8 +172,7 @@ def _drive(scene: Scene) -> dict[str, Any]:
     """What was driven from each stop of a drive (vertex, 2) m, by the frame that it stands at; x, y, m, of the goal."""
     legs, goal = {}, None
     for stop in gather.stops(scene.view):
-        leg = scene.view.bundle(stop.leg)
-        assert leg is not None
+        leg = artifact(scene.view, stop.leg)
         goal = [round(float(v), 4) for v in leg.meta["goal"][:2]]
         if len(leg["path"]):
             legs[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()
