@@ -256,7 +256,7 @@ def test_the_users_error_is_the_original_with_its_place(cache):
 
 
 def test_input_output_errors_are_tried_three_times_others_once(cache, tmp_path, monkeypatch):
-    monkeypatch.setattr("rille.pipeline.engine.task.BACK_OFF", 0.001)
+    monkeypatch.setattr("rille.pipeline.engine.task.PAUSES_SECONDS", (0.001, 0.001))
     _, result = run(cache, make=mischief("disk", tally=str(tmp_path / "disk")))
     assert result.ok
     assert (tmp_path / "disk").read_text() == "xxx"
