@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rille.pipeline.commands import batch
+from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import DriveOptions, Options
 
@@ -12,8 +13,8 @@ from rille.pipeline.runs.options import DriveOptions, Options
 def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:
     """Reconstruct sequences; the same command again resumes, and recomputes only what changed.
 
-    Of several a table says at the end what became of each; the exit code is that of the worst. One that cannot be
-    reconstructed ends the command, unless with --keep-going.
+    Of several a table lists the runs at the end, as `rille runs` does; the exit code is that of the worst. One that
+    cannot be reconstructed ends the command, unless with --keep-going.
 
     Parameters
     ----------
@@ -25,9 +26,10 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
     if not more:
         return _perform(seq, options)[0]
     sequences = (seq, *more)
-    ended = batch.each(sequences, lambda name: _perform(name, options), keep_going=options.keep_going)
-    print(batch.table(ended, sequences))
-    return batch.worst(ended)
+    code, ended = batch.each(sequences, lambda name: _perform(name, options), keep_going=options.keep_going)
+    print("\n".join(describe(end for _, end in ended if isinstance(end, Path))))
+    print("\n".join(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str)))
+    return code
 
 
 def _perform(seq: str, options: Options) -> tuple[int, Path]:
