@@ -24,8 +24,7 @@ class Ledger:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
         # Line by line: what a killed run had done by then is in the file.
-        place = path or Path(os.devnull)
-        self._file = place.open("w", encoding="utf-8", buffering=1)
+        self._file = (path or Path(os.devnull)).open("w", encoding="utf-8", buffering=1)
 
     def write(self, handle: Handle) -> None:
         """Write the outcome of a node: sources of its inputs, reason of the cache miss, what it took."""

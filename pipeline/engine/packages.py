@@ -31,7 +31,7 @@ NAMED = (
     *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pycolmap"),
     *("matplotlib", "jinja2"),
 )
-"""Distributions that ``rille --version`` and reports name."""
+"""Distributions that ``rille --version`` and reports name, and that workers of a cluster must share."""
 
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 

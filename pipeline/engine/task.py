@@ -18,7 +18,7 @@ from rille.pipeline.engine.runtime.kernels import COMPILING
 from rille.pipeline.engine.spec import Refs, Spec, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
-from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.declare import check_outputs
 from rille.stages.core.errors import RilleError
 
 PAUSES_SECONDS = 0.2, 0.8
@@ -79,8 +79,6 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     kernel = time.perf_counter() - begin
-    if not isinstance(result, Bundle):
-        raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
     # Before anything is stored: a wrong dtype or shape would be found by the next stage, under this key, for ever.
     check_outputs(stage, result)
     provenance = {
