@@ -14,7 +14,6 @@ from rille.pipeline.engine.plain import plain, raw
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Graph, Handle
-    from rille.pipeline.engine.run import Result
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -48,7 +47,7 @@ class Progress:
     def failed(self, label: str, error: BaseException) -> None:
         """A task or a flow failed."""
 
-    def close(self, result: Result) -> None:
+    def close(self) -> None:
         """The run has ended."""
 
     def total(self) -> int:
@@ -77,10 +76,6 @@ class Lines(Progress):
         """Say so at once."""
         self._say(f"{label} failed ({type(error).__name__})")
 
-    def close(self, result: Result) -> None:
-        """One closing line."""
-        self._say(summary(result))
-
     def _say(self, text: str) -> None:
         print(f"rille: {text}", file=self.stream, flush=True)
 
@@ -107,19 +102,9 @@ class Bar(Lines):
     def _show(self, handle: Handle) -> None:
         self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(handle.label))
 
-    def close(self, result: Result) -> None:
+    def close(self) -> None:
         """Take the bar away."""
         self.rich.stop()
-        super().close(result)
 
     def _say(self, text: str) -> None:
         self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
-
-
-def summary(result: Result) -> str:
-    """``12 computed, 388 cached in 14.2 s``, with what failed or was left out."""
-    counts = result.counts
-    parts = [f"{counts['computed']} computed", f"{counts['cached']} cached"]
-    parts += [f"{counts[status]} {status}" for status in ("planned", "failed") if counts[status]]
-    parts += [f"{counts['skipped']} left out"] if counts["skipped"] else []
-    return f"{', '.join(parts)} in {result.seconds:.1f} s"

@@ -194,7 +194,7 @@ class _Run:
             ended: dict[str, Any] = {} if self.result.interrupted else {"ok": self.result.ok}
             if self.graph.outdated:
                 ended["outdated"] = [h.label for h in self.graph.nodes if h.index in self.graph.outdated]
-            self.progress.close(self.result)  # first: a ledger on a full disk raises
+            self.progress.close()  # first: a ledger on a full disk raises
             self.ledger.run(seconds=round(self.result.seconds, 3), **ended)
             self.ledger.close()
         return self.result

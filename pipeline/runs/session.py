@@ -7,13 +7,11 @@ whose report names its holes.
 
 from __future__ import annotations
 
-import hashlib
 import sys
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -212,7 +210,8 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
     page = opened.folder / "report.html"
     # Answers of stages, and failures outside of the reconstruction, do not count; nor do they in the exit code.
     lost = lacking(missing)
-    lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}")
+    made = f"computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}"
+    lines.append(f"{page}  {made}, in {result.seconds:.1f} s")
     if opened.view.part:
         lines.append(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
     complaints = [
@@ -242,7 +241,7 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
     # After the layout, so that no folder is left if that refuses something.
-    folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
+    folder = _make_folder(options.runs / sequence.name, started)
     atomic.write(folder / "config.toml", text)
     view = RunView(
         **vars(settled),
@@ -315,24 +314,19 @@ def _idle(opened: _Opened) -> Iterator[str]:
         yield f"rille: error RIL-735: --force {', '.join(idle)}: this run has no such task: leave it out"
 
 
-def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
-    """Make a folder named by time and a short digest of the plan."""
+def _make_folder(parent: Path, started: datetime) -> Path:
+    """Make a folder named by the time of the start."""
     latest = parent / "latest"
     if latest.exists() and not latest.is_symlink():
         text = f"{latest} is no link to a run"
         raise ConfigError("RIL-765", text, remedy="move it away, or choose another --runs folder")
-    name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
-    # Two runs of one plan within a second: mkdir decides which of them has the name.
-    for suffix in chain([""], (f"-{number}" for number in count(2))):
-        folder = parent / (name + suffix)
-        try:
-            folder.mkdir(parents=True)
-            break
-        except OSError as error:
-            if folder.is_dir():
-                continue
-            text = f"cannot make {folder}: {reason_of(error)}"
-            raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
+    # With microseconds, so that runs within a second have names of their own, in their order.
+    folder = parent / f"{started:%Y%m%dT%H%M%SZ-%f}"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        text = f"cannot make {folder}: {reason_of(error)}"
+        raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
 
 
