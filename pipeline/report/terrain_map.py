@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rille.pipeline.export import colour
 from rille.pipeline.export.view import artifact
@@ -124,8 +125,6 @@ def _ratios(values: Floats) -> tuple[NDArray[Any], list[float]]:
 
 def _picture(*planes: NDArray[Any]) -> str:
     """Three planes (row, col) of bytes as a picture without loss."""
-    from PIL import Image
-
     # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
     picture = Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1))
     return canvas.compressed(picture, "png", compress_level=6)
@@ -133,8 +132,6 @@ def _picture(*planes: NDArray[Any]) -> str:
 
 def _ortho(scene: Scene, world: WorldTerrain, step: int) -> str:
     """The ortho image, grey or coloured, as a picture with loss."""
-    from PIL import Image
-
     look = _plane(world, "ortho", step)
     if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
         rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)

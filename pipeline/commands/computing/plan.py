@@ -26,6 +26,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
+from rille.pipeline.runs import run_files
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 
@@ -50,8 +51,6 @@ def plan(
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
-        from rille.pipeline.runs import run_files  # it imports matplotlib
-
         if graph.unfinished:  # some inputs are unknown, so they belong to the unknown tasks
             return
         run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
