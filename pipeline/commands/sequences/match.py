@@ -18,7 +18,6 @@ from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
-from rille.stages.core.errors import ConfigError
 from rille.stages.core.validity import matched
 
 
@@ -43,15 +42,13 @@ class Matcher:
         Raises
         ------
         ConfigError
-            They are of another section, or contradict the preset.
+            They are of another section, or not permitted.
         """
         nested = configuration.parse_assignments(self.assignments)
         configuration.refuse_other_sections(nested, ("hfvm",), "match")
-        values: dict[str, Any] = dict(nested.get("hfvm", {}))
-        if self.preset is not None and values.setdefault("preset", self.preset) != self.preset:
-            text = f"--preset {self.preset} and --set hfvm.preset={values['preset']} contradict each other"
-            raise ConfigError("RIL-986", text, remedy="leave one of them out")
-        return configuration.validate(configuration.stages()["hfvm"].params, values, "hfvm")
+        preset = {} if self.preset is None else {"preset": self.preset}
+        # --set overrides --preset, as it does --config.
+        return configuration.validate(configuration.stages()["hfvm"].params, preset | nested.get("hfvm", {}), "hfvm")
 
 
 def match(

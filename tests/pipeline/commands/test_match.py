@@ -42,6 +42,11 @@ def columns(path):
         return file.read(1)
 
 
+def test_a_parameter_that_is_set_overrides_the_preset():
+    assert command.Matcher("fast", ("hfvm.preset=paper",)).params().preset == "paper"
+    assert command.Matcher("fast", ("hfvm.band=4",)).params().preset == "fast"
+
+
 def test_writes_two_named_bands_and_says_what_it_found(folder, capsys):
     assert run(folder) == 0
     with rasterio.open(folder / "out.tif") as file:
