@@ -16,6 +16,7 @@ from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Run, Runs, cache_folder
+from rille.stages.core.errors import ConfigError, did_you_mean
 
 SHORT_DIGITS = 12
 """Shown hexadecimal digits of a digest."""
@@ -63,12 +64,15 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     ConfigError
         The run has no such task.
     """
-    rows = events.read(run / lookup.LEDGER)
-    row = lookup.row(rows, label, run)
+    rows = {row["label"]: row for row in events.read(run / lookup.LEDGER)}
+    if label not in rows:
+        text = f"run {lookup.name(run)} has no task {label!r}"
+        raise ConfigError("RIL-068", text, remedy=did_you_mean(label, rows) or f"it has {some(list(rows), 4)}")
+    row = rows[label]
     made = store.manifest(row["stage"], row["key"]) if "key" in row else None
     yield f"{label}: stage {row['stage']}, {row['status']} in run {lookup.name(run)}"
     yield from _fate(row, run, made, store)
-    yield from _inputs(row, {r["label"]: r for r in rows})
+    yield from _inputs(row, rows)
     if made is None:
         if "key" in row and row["status"] in ("computed", "cached"):
             gone = f"{row['key'][:SHORT_DIGITS]} has gone from {store.root}, or the run used another cache (--cache)"
