@@ -105,7 +105,6 @@ WRONG = {
         ("other --to obj", "RIL-001"),
         ("no-such-run --to laz", "RIL-067"),
         ("runs/other --to colmap", "RIL-067"),
-        ("runs/other/latest --to laz --to glb -o x", "RIL-020"),
         ("runs/other/latest --to laz -o cloud.ply", "RIL-871"),
     ],
     "compare-dem": [

@@ -164,12 +164,6 @@ def test_an_export_of_a_run_whose_ledger_is_none(run: Path, kind: str, capsys: A
     assert told(capsys, "export", "seq/2", "--to", kind, "--cache", "cache") == (2, ["RIL-980"])
 
 
-def test_a_form_that_cannot_be_made_does_not_keep_others_from_being_tried(run: Path, capsys: Any) -> None:
-    (run / "ledger.jsonl").write_text('{"label": "a"}\n')
-    both = told(capsys, "export", "seq/2", "--to", "nav2", "--to", "colmap", "--cache", "cache")
-    assert both == (2, ["RIL-980", "RIL-980"])
-
-
 def huge(folder: Path, axis: int) -> None:
     """A zarr group that claims a square of so many cells, and holds none."""
     group = zarr.create_group(store=str(folder), zarr_format=2)
