@@ -57,7 +57,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
     # Two bytes a height; 0 is undefined.
     height = _steps(z, low, max(high - low, 1e-9), np.uint16)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
-    risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
+    risk, reason, p_hazard = (_of_risk(scene.risk, world, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
     count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
     slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, np.uint8)
@@ -98,12 +98,10 @@ def _plane(world: WorldTerrain, name: str, step: int) -> Floats:
     return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
 
 
-def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
+def _of_risk(risk: WorldTerrain | None, world: WorldTerrain, name: str, missing: float) -> Floats:
     """An array of the risk map on the cells of the terrain."""
-    assert scene.world is not None
-    if scene.risk is None or name not in scene.risk.arrays:
-        return np.full(scene.world.lattice.shape, missing)
-    return mosaic([(scene.risk.lattice, scene.risk.arrays[name])], missing, scene.world.lattice)
+    judged = [] if risk is None or name not in risk.arrays else [(risk.lattice, risk.arrays[name])]
+    return mosaic(judged, missing, world.lattice)
 
 
 def _steps(values: NDArray[Any], low: float, span: float, kind: type[np.uint8 | np.uint16]) -> NDArray[Any]:
