@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 from rille.pipeline.engine.plain import plain, raw
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.graph import Graph, Handle
+    from rille.pipeline.engine.graph import Handle
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -21,9 +21,8 @@ INTERVAL = 5.0
 
 def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
     """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``."""
-    stream = stream or sys.stderr
     if mode == "auto":
-        mode = "bar" if stream.isatty() else "plain"
+        mode = "bar" if (stream or sys.stderr).isatty() else "plain"
     kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
     return kinds[mode](stream)
 
@@ -33,15 +32,13 @@ class Progress:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
-        self.graph: Graph | None = None
         self.done, self.shown = 0, time.monotonic()
 
-    def open(self, graph: Graph) -> None:
-        """The run of a graph begins; the graph may still grow."""
-        self.graph = graph
+    def open(self) -> None:
+        """The run begins."""
 
-    def resolved(self, handle: Handle) -> None:
-        """The outcome of a node is known."""
+    def resolved(self, handle: Handle, total: int) -> None:
+        """The outcome of a node is known, of so many that are known and wanted by now."""
         self.done += 1
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -50,27 +47,21 @@ class Progress:
     def close(self) -> None:
         """The run has ended."""
 
-    def total(self) -> int:
-        """Nodes that are known and wanted by now."""
-        if self.graph is None:
-            return 0
-        return len(self.graph.nodes if self.graph.cut is None else self.graph.needed)
-
 
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def resolved(self, handle: Handle) -> None:
+    def resolved(self, handle: Handle, total: int) -> None:
         """Say at once what was compiled, and show where the run is."""
-        super().resolved(handle)
+        super().resolved(handle, total)
         if handle.took.compiling >= 1.0:
             self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
-        self._show(handle)
+        self._show(handle, total)
 
-    def _show(self, handle: Handle) -> None:
+    def _show(self, handle: Handle, total: int) -> None:
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}")
+            self._say(f"{self.done}/{total} tasks, {handle.label} {handle.status}")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
@@ -94,13 +85,12 @@ class Bar(Lines):
         self.rich = RichProgress(*columns, named, console=Console(file=raw(self.stream)), transient=True)
         self.task = self.rich.add_task("", total=None)
 
-    def open(self, graph: Graph) -> None:
+    def open(self) -> None:
         """Show the bar."""
-        super().open(graph)
         self.rich.start()
 
-    def _show(self, handle: Handle) -> None:
-        self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(handle.label))
+    def _show(self, handle: Handle, total: int) -> None:
+        self.rich.update(self.task, completed=self.done, total=total, description=plain(handle.label))
 
     def close(self) -> None:
         """Take the bar away."""

@@ -209,7 +209,7 @@ class _Run:
             self.options.kept.append(self.workers)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph)
+        self.progress.open()
         self.store.survey(self.graph.sequence)
         while True:
             while self._take() or self._go_on():
@@ -338,7 +338,7 @@ class _Run:
         handle.status = status
         self.ledger.write(handle)
         if handle.index not in self.before:  # a task that was computed again counts once
-            self.progress.resolved(handle)
+            self.progress.resolved(handle, len(self.graph.nodes if self.graph.cut is None else self.graph.needed))
 
     def _skip(self, handle: Handle, missing: Handle) -> None:
         planned, handle.ref = missing.status == "planned", None

@@ -51,9 +51,8 @@ def plan(
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
-        if graph.unfinished:  # some inputs are unknown, so they belong to the unknown tasks
-            return
-        run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
+        if not graph.unfinished:  # else some inputs are unknown, so they belong to the unknown tasks
+            run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))

@@ -5,12 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.pipeline.engine.plain import raw, warn
@@ -21,42 +19,13 @@ from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Outp
 from rille.stages.core.validity import matched
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Matcher:
-    """How two images are matched.
-
-    Parameters
-    ----------
-    preset
-        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
-        follows the publication to the letter.
-    """
-
-    preset: Literal["default", "fast", "accurate", "paper"] | None = None
-    assignments: Assignments = ()
-
-    def params(self) -> Any:
-        """Parameters of the matcher.
-
-        Raises
-        ------
-        ConfigError
-            They are of another section, or not permitted.
-        """
-        nested = configuration.parse_assignments(self.assignments)
-        configuration.refuse_other_sections(nested, ("hfvm",), "match")
-        preset = {} if self.preset is None else {"preset": self.preset}
-        # --set overrides --preset, as it does --config.
-        return configuration.validate(configuration.stages()["hfvm"].params, preset | nested.get("hfvm", {}), "hfvm")
-
-
 def match(
     left: Path,
     right: Path,
     *,
     output: Annotated[Path, Output] = Path("disparity.tif"),
-    matcher: Matcher = Matcher(),
+    preset: Literal["default", "fast", "accurate", "paper"] | None = None,
+    assignments: Assignments = (),
     dense: Annotated[bool, FLAG] = False,
     confidence: Path | None = None,
 ) -> int:
@@ -73,13 +42,20 @@ def match(
         Search image.
     output
         TIFF to write.
+    preset
+        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
+        follows the publication to the letter.
     dense
         Fill undefined disparities by interpolation.
     confidence
         TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
         backmatch_error (pixels).
     """
-    params = matcher.params()
+    nested = configuration.parse_assignments(assignments)
+    configuration.refuse_other_sections(nested, ("hfvm",), "match")
+    # --set overrides --preset, as it does --config.
+    given = ({} if preset is None else {"preset": preset}) | nested.get("hfvm", {})
+    params: Any = configuration.validate(configuration.stages()["hfvm"].params, given, "hfvm")
     taken = {left.resolve(): "an image", right.resolve(): "an image"}
     check_output(output, ".tif", ".tiff", others=taken)
     if confidence is not None:
