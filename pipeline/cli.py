@@ -55,8 +55,7 @@ def _versions() -> str:
 
     from rille.pipeline.engine.packages import installed
 
-    versions = installed()
-    versions = {"rille": versions["rille"], **versions, "system": f"{platform.system()} {platform.machine()}"}
+    versions = installed() | {"system": f"{platform.system()} {platform.machine()}"}
     return "\n".join(f"{name:24s} {version}" for name, version in versions.items())
 
 

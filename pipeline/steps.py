@@ -347,8 +347,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
 
     if every not in range(1, 100_000):
         raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
-    given = _disparity(disparity, pair)
-    found = points_of(given, pair.sequence.rig, int(every))
+    found = points_of(_disparity(disparity, pair), pair.sequence.rig, int(every))
     return xarray.Dataset(
         {
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),

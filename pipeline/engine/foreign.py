@@ -22,8 +22,6 @@ from rille.pipeline.engine.plain import one_line
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError
 
-Identity = Mapping[str, str]
-
 
 def identity() -> dict[str, str]:
     """Return by name the facts that client and workers must share: packages with the processor that they work for."""
@@ -31,7 +29,7 @@ def identity() -> dict[str, str]:
     return {"Python": platform.python_version(), "source code": code} | {name: version(name) for name in NAMED}
 
 
-def compare(ours: Identity, probe: Path) -> None:
+def compare(ours: Mapping[str, str], probe: Path) -> None:
     """Run on a worker: compare it with the client, which has left a probe in the cache.
 
     Raises

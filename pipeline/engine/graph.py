@@ -41,9 +41,6 @@ class Took:
     worker: str = ""
 
 
-NOTHING = Took()
-
-
 @dataclass(eq=False, slots=True)
 class Handle(Generic[F]):
     """A node of the graph and what became of it.
@@ -65,7 +62,7 @@ class Handle(Generic[F]):
     cause: str = ""
     key: str = ""
     expect: float = 0.0
-    took: Took = NOTHING
+    took: Took = Took()
     error: BaseException | None = None
 
     @property

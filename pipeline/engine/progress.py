@@ -23,8 +23,7 @@ def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
     """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``."""
     if mode == "auto":
         mode = "bar" if (stream or sys.stderr).isatty() else "plain"
-    kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
-    return kinds[mode](stream)
+    return {"bar": Bar, "plain": Lines, "quiet": Progress}[mode](stream)
 
 
 class Progress:

@@ -365,8 +365,7 @@ class _Run:
             self._fail(handle, ended)
 
     def _succeed(self, handle: Handle, outcome: Outcome) -> None:
-        chained = not handle.key
-        if chained and all(h.done for h in handle.upstream()):
+        if not handle.key and all(h.done for h in handle.upstream()):
             refs = handle.refs()
             handle.key = key_of(handle.spec, refs)
             if not outcome.cached:

@@ -96,8 +96,7 @@ def read_elevation(path: Path) -> DemFile:
 
 def _check_known(path: Path, grid: Grid) -> None:
     if not np.isfinite(grid.values).any():
-        text = f"{path} has no known cell among {grid.values.size}"
-        raise InputError("RIL-628", text, remedy="give another")
+        raise InputError("RIL-628", f"{path} has no known cell among {grid.values.size}", remedy="give another")
 
 
 def _without_marks(dem: DemFile) -> DemFile:

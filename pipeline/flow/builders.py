@@ -20,7 +20,7 @@ from rille.stages.calibration.orientation import orientation_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
 from rille.stages.calibration.synchrony import synchrony_stage
-from rille.stages.core.declare import F, NoParams, Params, Stage
+from rille.stages.core.declare import F, NoParams, Stage
 from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
 from rille.stages.facts.imaging import PyramidFacts, QualityFacts
@@ -145,8 +145,7 @@ class Builder:
         ``given`` are its inputs (handles) and arguments; None stands for one that is absent.
         """
         # A section is named as its stage; a stage without parameters has none.
-        chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
-        return self.graph.call(stage, label, chosen, **given)
+        return self.graph.call(stage, label, params or getattr(self.config, stage.name, NO_PARAMS), **given)
 
     def recalibrate(self, correction: list[float], since: int) -> None:
         """Correct the calibration; tasks that do not depend on it are laid out as before."""

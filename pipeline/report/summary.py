@@ -305,8 +305,7 @@ def _way_words(view: RunView, length: float | None) -> str:
 def _seams(view: RunView) -> dict[str, Any] | None:
     """The audit of seams: models, how many seams there are and the worst of them."""
     audit = facts_of(view, view.products.overlap_audit)
-    names = ("models", "seam_count", "seams")
-    return {name: audit[name] for name in names} if audit.get("seams") else None
+    return {name: audit[name] for name in ("models", "seam_count", "seams")} if audit.get("seams") else None
 
 
 def _rig(scene: Scene) -> dict[str, Any] | None:

@@ -25,16 +25,15 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
     """
     if not more:
         return _perform(seq, options)[0]
-    sequences = (seq, *more)
-    code, ended = batch.each(sequences, lambda name: _perform(name, options), keep_going=options.keep_going)
+    code, ended = batch.each((seq, *more), lambda name: _perform(name, options), keep_going=options.keep_going)
     print("\n".join(describe(end for _, end in ended if isinstance(end, Path))))
     print("\n".join(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str)))
     return code
 
 
-def _perform(seq: str, options: Options) -> tuple[int, Path]:
+def _perform(seq: str, options: Options, verb: str = "reconstruct") -> tuple[int, Path]:
     """Run a sequence; return the exit code and the folder of the results."""
-    result = session.perform(seq, options)
+    result = session.perform(seq, options, verb=verb)
     result.print()
     return result.code, result.folder
 
@@ -50,6 +49,4 @@ def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -
     seq
         A simulated sequence; mockup-loop.
     """
-    result = session.perform(seq, options, verb="drive")
-    result.print()
-    return result.code
+    return _perform(seq, options, "drive")[0]

@@ -95,8 +95,7 @@ def _placed(paths: Sequence[Path], one: DemFile, other: DemFile) -> tuple[Floats
     """Motion (2, 3) of x, y that aligns the terrain of a run with that of another, and its facts for the JSON file."""
     files = [path for path in paths if not path.is_dir()]
     if files:
-        text = f"{files[0]} is no run: it has no ortho image"
-        raise InputError("RIL-908", text, remedy="leave --align place out")
+        raise InputError("RIL-908", f"{files[0]} is no run: it has no ortho image", remedy="leave --align place out")
     image, reference = (read_dem.read_ortho(path / "ortho.tif")[0] for path in paths)
     placed = register((image, reference), (one.grid, other.grid))
     x, y, heading = from_above(placed.pose)

@@ -210,8 +210,7 @@ class Store:
     def set_aside(self, stage: str, key: str, reason: str) -> bool:
         """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only."""
         try:
-            path = self.root / artifact_path(stage, key)
-            aside = folder.quarantine(path, self.root, f"{stage}-{key[:16]}")
+            aside = folder.quarantine(self.root / artifact_path(stage, key), self.root, f"{stage}-{key[:16]}")
         except OSError as error:
             return isinstance(error, FileNotFoundError)  # another run has set it aside
         with suppress(OSError):
