@@ -26,8 +26,8 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
     if not more:
         return _perform(seq, options)[0]
     code, ended = batch.each((seq, *more), lambda name: _perform(name, options), keep_going=options.keep_going)
-    print("\n".join(describe(end for _, end in ended if isinstance(end, Path))))
-    print("\n".join(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str)))
+    runs = describe(end for _, end in ended if isinstance(end, Path))
+    print("\n".join([*runs, *(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str))]))
     return code
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from rille.pipeline.commands import batch
-from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
+from rille.pipeline.commands.computing import reconstruct
+from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE, Options
 from rille.stages.core.errors import DegenerateError, InputError
 
 ENDS = {
@@ -60,3 +62,20 @@ def test_an_interrupt_ends_the_command():
 
     with pytest.raises(KeyboardInterrupt):
         batch.each(["a", "b"], one, keep_going=True)
+
+
+def test_runs_are_listed_and_then_the_sequences_without_one(tmp_path, monkeypatch, capsys):
+    def one(name: str, options: Options) -> tuple[int, Path]:
+        if name == "none":
+            raise ENDS["none"]
+        (tmp_path / name / "1").mkdir(parents=True)
+        (tmp_path / name / "1" / "ledger.jsonl").write_text(json.dumps({"run": {"ok": True, "total": 2.5}}) + "\n")
+        return COMPLETE, tmp_path / name / "1"
+
+    monkeypatch.setattr(reconstruct, "_perform", one)
+    assert reconstruct.reconstruct("none", "whole", options=Options(keep_going=True)) == USAGE
+    rows = [row.split() for row in capsys.readouterr().out.splitlines()]
+    assert rows[1:] == [["whole/1", "complete", "0", "0", "2.5"], ["none", "RIL-276"]]
+    monkeypatch.setattr(reconstruct, "_perform", lambda name, options: (COMPLETE, tmp_path / "whole" / "1"))
+    reconstruct.reconstruct("whole", "whole")
+    assert all(capsys.readouterr().out.splitlines())
