@@ -182,7 +182,7 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
     found = json.loads((latest(cold) / "report.json").read_text())
     assert not found["complete"]
     lost = lacking(found["missing"])
-    assert told.out.endswith(f"missing {len(lost)}\n")
+    assert f", missing {len(lost)}, in " in told.out
     assert [line for line in told.err.splitlines() if line.startswith("rille: missing: ")] == [
         f"rille: missing: {m['what']}: {m['why']}" for m in lost
     ]
