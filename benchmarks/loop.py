@@ -64,7 +64,7 @@ def drive(settings: list[str]) -> dict[str, Any]:
     try:
         store = Store(folder)
         flow = Drive(graph, sequence, config_of([*layers, {"drive": {"goal": goal}}]))
-        flow.build()
+        graph.flow(flow.steps())
         result = run(graph, store, RunOptions(executor="inline", keep_going=True))
         found = figures(flow, store)
     finally:

@@ -15,7 +15,13 @@ from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 from rille.datasets.text.reading import TABLE, read_lines, read_text
+from rille.pipeline.engine import events
+from rille.pipeline.engine.failures import translated
+from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.runs import lookup
 from rille.pipeline.steps import StereoSequence, assignments, place_of
 from rille.stages.core.errors import InputError, RilleError
 
@@ -81,10 +87,7 @@ def reconstruct(
     /...computed..., cached 0, missing ...
     2 m
     """
-    from rille.pipeline.engine.runtime.environment import prepare_environment
-
     prepare_environment()
-    from rille.pipeline.engine.failures import translated
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
@@ -159,8 +162,6 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
     Traceback (most recent call last):
     rille.stages.core.errors.ConfigError: no run 'mockup-shrot': no/such/folder holds none
     """
-    from rille.pipeline.runs import lookup
-
     return Run(lookup.find(expanduser(path), Path(runs).expanduser()))
 
 
@@ -195,11 +196,8 @@ class Run:
 
         A task that this run computed has ``seconds`` and more of what it took, and ``reason``: why it was not cached.
         """
-        from rille.pipeline.engine import events
-        from rille.pipeline.runs.lookup import LEDGER
-
         with self._reading():
-            return list(events.read(self.folder / LEDGER))
+            return list(events.read(self.folder / lookup.LEDGER))
 
     @property
     def metrics(self) -> Mapping[str, Any]:
@@ -246,7 +244,6 @@ class Run:
         ConfigError
             It is not as Rille writes it.
         """
-        import numpy as np
         import xarray
 
         with self._reading():
@@ -282,8 +279,6 @@ class Run:
             return kind(self.report[name])
 
     def _reading(self) -> AbstractContextManager[None]:
-        from rille.pipeline.runs import lookup
-
         return lookup.reading(self.folder)
 
     def _json(self, name: str) -> Any:

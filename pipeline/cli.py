@@ -55,8 +55,7 @@ def _versions() -> str:
 
     from rille.pipeline.engine.packages import installed
 
-    versions = installed()
-    versions = {"rille": versions["rille"], **versions, "system": f"{platform.system()} {platform.machine()}"}
+    versions = installed() | {"system": f"{platform.system()} {platform.machine()}"}
     return "\n".join(f"{name:24s} {version}" for name, version in versions.items())
 
 
@@ -123,7 +122,7 @@ def _run(argv: list[str] | None) -> int:
         console = Console(file=raw(sys.stdout))  # of the help, which has colours
         chosen = program(listed=True) if tokens in ([], ["-h"], ["--help"]) else app
         code = chosen(tokens, console=console, exit_on_error=False, print_error=False, result_action="return_value")
-        # --help and --version give no code.
+        # Most commands either complete, and give no code, or raise.
         return code if isinstance(code, int) else COMPLETE
     except KeyboardInterrupt:
         print("rille: interrupted; the same command resumes from here", file=sys.stderr)

@@ -34,10 +34,14 @@ import tomli_w
 from numpy.typing import NDArray
 
 from rille.datasets import registry
+from rille.datasets.images.files import sound
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.reading import read_toml
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.engine.spec import map_ports
 from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
+from rille.pipeline.flow import config
 from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Rig
@@ -45,11 +49,10 @@ from rille.stages.geometry.geometry import Rig
 if TYPE_CHECKING:
     import xarray
 
-    from rille.pipeline.engine.graph import Handle
     from rille.pipeline.flow.builders import Builder
 
 Settings = Mapping[str, Any]
-Known = dict["Handle", Bundle]
+Known = dict[Handle, Bundle]
 
 
 @dataclass(frozen=True)
@@ -123,8 +126,6 @@ class StereoPair:
     @property
     def settings(self) -> dict[str, Any]:
         """Parameters that suit the sequence, by section; what is given to a function wins."""
-        from rille.pipeline.flow import config
-
         source = self.sequence.source
         vehicle = {} if source.vehicle is None else {"vehicle": source.vehicle.model_dump(mode="json")}
         return config.merge(vehicle, config.expand(source.defaults))
@@ -170,8 +171,6 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     >>> len(sequence), sequence[0].left.dims
     (9, ('row', 'col'))
     """
-    from rille.pipeline.flow import config
-
     words = assignments(settings)
     opened = registry.open_sequence(place_of(path), config.merge({}, settings))
     said = (word for one in words for word in ("--set", one))
@@ -180,8 +179,6 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
 
 def _reopened(path: str, *assigned: str) -> StereoSequence:
     """The sequence of ``Sequence.opened``: its path, and its settings as ``--set section.key=value``."""
-    from rille.pipeline.flow import config
-
     return open(path, **config.parse_assignments(assigned[1::2]))
 
 
@@ -207,8 +204,6 @@ def assignments(settings: Mapping[str, Settings]) -> list[str]:
     >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
     ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
     """
-    from rille.pipeline.flow import config
-
     words = []
     check_sections(settings)
     for section, values in config.merge({}, settings).items():
@@ -266,7 +261,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     [-7.0, 2.0]
     """
     prepare_environment()
-    from rille.pipeline.flow import config, tiles
+    from rille.pipeline.flow import tiles
     from rille.pipeline.runs.doubts import doubts, levelled
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
@@ -352,8 +347,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
 
     if every not in range(1, 100_000):
         raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
-    given = _disparity(disparity, pair)
-    found = points_of(given, pair.sequence.rig, int(every))
+    found = points_of(_disparity(disparity, pair), pair.sequence.rig, int(every))
     return xarray.Dataset(
         {
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
@@ -478,7 +472,6 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     True
     """
     prepare_environment()
-    from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
     from rille.stages.terrain.locus import stage as locus_stage
 
@@ -542,7 +535,6 @@ def path(
     [0.2, 0.63]
     """
     prepare_environment()
-    from rille.pipeline.flow import config
     from rille.stages.hazard import risk as risk_stage
     from rille.stages.planning import path as path_stage
 
@@ -560,8 +552,6 @@ def path(
 
 def _builder(pair: StereoPair, settings: Settings) -> Builder:
     prepare_environment()
-    from rille.pipeline.engine.graph import Graph
-    from rille.pipeline.flow import config
     from rille.pipeline.flow.builders import Builder
 
     return Builder(Graph(), pair.sequence.source, config.build(settings))
@@ -569,9 +559,6 @@ def _builder(pair: StereoPair, settings: Settings) -> Builder:
 
 def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
     """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
-    from rille.datasets.images.files import sound
-    from rille.pipeline.engine.spec import map_ports
-
     if handle in known:
         return known[handle]
     # Images are kept: left and right of one pair, and every step of it, ask for them again.
@@ -599,8 +586,6 @@ def _settings(data: Any) -> dict[str, Any]:
 
 def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     """Settings of the step before, and what is given now over them."""
-    from rille.pipeline.flow import config
-
     settings: dict[str, Any] = {}
     # Later layers win: settings of the sequence, settings of the step before, settings of this call.
     for layer in (*more[:-1], _settings(data), more[-1]):

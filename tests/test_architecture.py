@@ -169,7 +169,7 @@ CLASSES = error_classes(list(TREES.values()))
 
 
 def test_every_error_has_a_literal_code() -> None:
-    assert {"InputError", "GoneError", "WorkerDiedError"} <= CLASSES
+    assert {"InputError", "GoneError", "StoreError"} <= CLASSES
     bad = [f"{p.relative_to(ROOT)}:{line}" for p, tree in TREES.items() for line in without_code(tree, CLASSES)]
     assert not bad, f"give a code that is free as first argument: {bad}"
 

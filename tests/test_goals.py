@@ -97,7 +97,7 @@ def test_an_imu_with_exchanged_axes_is_named(
 @pytest.mark.data
 def test_flying_drone(data_dir: Path, tmp_path: Path) -> None:
     manifest = tmp_path / "flight.toml"
-    assert init(data_dir / "euroc_moving", output=manifest) == 0
+    init(data_dir / "euroc_moving", output=manifest)
     sensor = (data_dir / "euroc_moving" / "cam0_sensor.yaml").read_text().split("\n", 1)[1]  # behind %YAML:1.0
     mount = np.array(yaml.safe_load(sensor)["T_BS"]["data"]).reshape(4, 4)[:3]
     text = manifest.read_text()

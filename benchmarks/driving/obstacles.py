@@ -45,7 +45,7 @@ def trial(settings: list[str]) -> dict[str, Any]:
     try:
         store = Store(folder)
         flow = OneLeg(graph, sequence, config_of(layers))
-        flow.build()
+        graph.flow(flow.steps())
         result = run(graph, store, RunOptions(executor="inline", keep_going=True))
         found = stone(flow, store)
     finally:

@@ -44,7 +44,7 @@ def gc(
     cache: CacheFolder = None,
     runs: Runs = RUNS,
     dry_run: Annotated[bool, FLAG] = False,
-) -> int:
+) -> None:
     """Remove artifacts that no kept run refers to, leftovers of interrupted runs, and kernels that nothing uses.
 
     What was made or used within a day stays: a run may be under way.
@@ -72,4 +72,3 @@ def gc(
     verb, artifacts = "would remove" if dry_run else "removed", [size for sizes in cleared.values() for size in sizes]
     size = sum(artifacts) + sum(leftovers)
     print(f"{verb} {len(artifacts)} artifacts and {len(leftovers)} leftovers, {size / 2**20:.1f} MiB")
-    return COMPLETE

@@ -14,13 +14,13 @@ from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.pipeline.flow import config
 from rille.pipeline.runs.lookup import refuse_unknown
-from rille.pipeline.runs.options import COMPLETE, FLAG
+from rille.pipeline.runs.options import FLAG
 from rille.stages.core.declare import Params
 
 SIGNS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
-def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> int:
+def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> None:
     """Print all parameters, or those of one section: default, what is permitted, and meaning.
 
     Parameters
@@ -35,7 +35,6 @@ def params(section: str = "", *, markdown: Annotated[bool, FLAG] = False) -> int
         refuse_unknown("params", [section], known, "section")
     chosen = {section: known[section]} if section else known
     print("\n".join(page(chosen) if markdown else plain(chosen)))
-    return COMPLETE
 
 
 def sections() -> dict[str, Params]:

@@ -121,7 +121,7 @@ def module_digests(module: str) -> dict[str, str]:
         queue += source.imports
         found |= _other_languages(name, path)
         # Importing a module runs the __init__ of every package above it.
-        queue += _parents(name)
+        queue.append(name.rpartition(".")[0])
     return dict(sorted(found.items()))
 
 
@@ -167,17 +167,9 @@ def _other_languages(name: str, path: Path) -> dict[str, str]:
 
 
 @cache
-def _parents(name: str) -> tuple[str, ...]:
-    parts = name.split(".")
-    return tuple(".".join(parts[:n]) for n in range(1, len(parts)))
-
-
-@cache
 def _roots(package: str) -> tuple[Path, ...]:
     spec = importlib.util.find_spec(package)
-    if spec is None:
-        return ()
-    return tuple(Path(p) for p in spec.submodule_search_locations or ())
+    return tuple(map(Path, (spec and spec.submodule_search_locations) or ()))
 
 
 @cache

@@ -24,11 +24,10 @@ class Ledger:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
         # Line by line: what a killed run had done by then is in the file.
-        place = path or Path(os.devnull)
-        self._file = place.open("w", encoding="utf-8", buffering=1)
+        self._file = (path or Path(os.devnull)).open("w", encoding="utf-8", buffering=1)
 
     def write(self, handle: Handle) -> None:
-        """Write the outcome of a node: sources of its inputs, reason of the cache miss, time and memory."""
+        """Write the outcome of a node: sources of its inputs, reason of the cache miss, what it took."""
         row: dict[str, Any] = {
             "label": handle.label,
             "stage": handle.stage,
@@ -39,7 +38,8 @@ class Ledger:
             "digest": handle.ref and handle.ref.digest,
             "error": handle.error and {"type": type(handle.error).__name__, "message": str(handle.error)},
         }
-        took = _took(handle) if handle.status == "computed" else {}
+        took = asdict(handle.took) if handle.status == "computed" else {}
+        took = {name: round(value, 4) if isinstance(value, float) else value for name, value in took.items()}
         self._line({name: value for name, value in row.items() if value} | took)
 
     def note(self, label: str, status: str, reason: str) -> None:
@@ -57,15 +57,6 @@ class Ledger:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def _took(handle: Handle) -> dict[str, Any]:
-    """Times (seconds; of day since 1970) and bytes of a computed task; see
-    :class:`~rille.pipeline.engine.graph.Took`."""
-    took, ref = handle.took, handle.ref
-    assert ref is not None
-    row = asdict(took) | {"ended": took.started + took.seconds, "bytes": ref.nbytes, "stored": ref.stored}
-    return {name: round(value, 4) if isinstance(value, float) else value for name, value in row.items()}
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -13,37 +13,23 @@ import platform
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine.code_digest import OWN, tree_digest
-from rille.pipeline.engine.packages import version
+from rille.pipeline.engine.packages import NAMED, version
 from rille.pipeline.engine.plain import one_line
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError
 
-PACKAGES = (
-    *("dask", "distributed", "google-crc32c", "llvmlite", "numba", "numcodecs", "numpy", "pydantic", "zarr"),
-    *("opencv-python-headless", "pycolmap", "rasterio", "scipy"),
-)
-"""Distributions whose version must be the client's, and the kind of processor that they work for."""
-
-Identity = Mapping[str, str]
-
 
 def identity() -> dict[str, str]:
-    """Return by name the facts that client and workers must share; a missing package has no version."""
-    found = {"Python": platform.python_version(), "source code": tree_digest((*OWN, "rille.pipeline"))[:12]}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "none"
-    return found
+    """Return by name the facts that client and workers must share: packages with the processor that they work for."""
+    code = tree_digest((*OWN, "rille.pipeline"))[:12]
+    return {"Python": platform.python_version(), "source code": code} | {name: version(name) for name in NAMED}
 
 
-def compare(ours: Identity, probe: Path) -> None:
+def compare(ours: Mapping[str, str], probe: Path) -> None:
     """Run on a worker: compare it with the client, which has left a probe in the cache.
 
     Raises

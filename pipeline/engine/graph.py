@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any, Generic, NamedTuple, cast
 
 from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
@@ -42,9 +41,6 @@ class Took:
     worker: str = ""
 
 
-NOTHING = Took()
-
-
 @dataclass(eq=False, slots=True)
 class Handle(Generic[F]):
     """A node of the graph and what became of it.
@@ -66,7 +62,7 @@ class Handle(Generic[F]):
     cause: str = ""
     key: str = ""
     expect: float = 0.0
-    took: Took = NOTHING
+    took: Took = Took()
     error: BaseException | None = None
 
     @property
@@ -90,7 +86,7 @@ class Handle(Generic[F]):
 
     def refs(self) -> Refs:
         """References of all inputs by port; call it when they are done."""
-        return map_ports(_ref, self.inputs)
+        return map_ports(lambda h: cast(Ref, h.ref), self.inputs)
 
 
 class MissingError(Exception):
@@ -120,10 +116,7 @@ class Complete(frozenset[str]):
     """Names of stages of which a flow lays out no more tasks: if nothing else is wanted, the flow ends there."""
 
 
-Awaited = Handle | Maybe | Sequence[Handle]
-"""What a flow may wait for."""
-
-Wait = Awaited | Complete
+Wait = Handle | Maybe | Sequence[Handle] | Complete
 """What a flow may yield."""
 
 
@@ -205,7 +198,7 @@ class Graph:
             The inputs do not fit the ports of the stage, or the parameters are of another model.
         """
         module = stage if isinstance(stage, str) else stage.module
-        spec = Spec(module, label, params, dict(args) if args else _NONE, dict(hints) if hints else _NONE)
+        spec = Spec(module, label, params, dict(args or {}), dict(hints or {}))
         given = {p: h if isinstance(h, Handle) else list(h) for p, h in (inputs or {}).items()}
         while (taken := self._labels.get(spec.label)) is not None:
             if not self.outdated:
@@ -239,22 +232,15 @@ class Graph:
         self.unfinished += 1
         self._go_on(steps, lambda: next(steps))
 
-    def _wait(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> Awaited | None:
-        """What a flow waits for next; None at its end, or if no later task is wanted."""
-        try:
-            wanted = step()
-            while isinstance(wanted, Complete):
-                self._complete |= wanted
-                if self.cut is not None and self.cut.stages <= self._complete:
-                    return None
-                wanted = next(steps)
-        except StopIteration:
-            return None
-        return wanted
-
     def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> None:
         try:
-            wanted = self._wait(steps, step)
+            wanted: Wait | None = step()
+            while isinstance(wanted, Complete):
+                self._complete |= wanted
+                unwanted = self.cut is not None and self.cut.stages <= self._complete
+                wanted = None if unwanted else next(steps)
+        except StopIteration:
+            wanted = None
         except MissingError as error:
             self.unfinished -= 1
             # The flow never goes on; the end of the run names the tasks that it waited for.
@@ -277,29 +263,15 @@ class Graph:
         self.waiting.append(Waiting(handles, resume, holes=True))
 
 
-_NONE: dict[str, Any] = {}
-"""Shared by all nodes without arguments: an empty dictionary takes 64 bytes."""
-
-
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:
     stage = spec.stage
     if not isinstance(spec.params, stage.params):
         raise TypeError(f"{spec.label}: params are {type(spec.params).__name__}, not {stage.params.__name__}")
-    ports, needed = _ports(stage.inputs)
+    ports = {port.rstrip("*?"): port for port in stage.inputs}
+    needed = {name for name, port in ports.items() if "?" not in port}
     if not (needed <= given.keys() <= ports.keys()):
         unknown, missing = sorted(given.keys() - ports.keys()), sorted(needed - given.keys())
         raise TypeError(f"{spec.label}: unknown inputs {unknown}, missing inputs {missing} (ports {stage.inputs})")
     for name, handle in given.items():
         if isinstance(handle, list) != ("*" in ports[name]):
             raise TypeError(f"{spec.label}: input {name} takes {'a list' if '*' in ports[name] else 'one handle'}")
-
-
-@cache
-def _ports(declared: tuple[str, ...]) -> tuple[dict[str, str], frozenset[str]]:
-    """Ports by name, and the names of those that must be given."""
-    return {port.rstrip("*?"): port for port in declared}, frozenset(p.rstrip("*") for p in declared if "?" not in p)
-
-
-def _ref(handle: Handle) -> Ref:
-    assert handle.ref is not None, handle.label
-    return handle.ref

@@ -31,7 +31,7 @@ NAMED = (
     *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pycolmap"),
     *("matplotlib", "jinja2"),
 )
-"""Distributions that ``rille --version`` and reports name."""
+"""Distributions that ``rille --version`` and reports name, and that workers of a cluster must share."""
 
 CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 
@@ -53,7 +53,7 @@ def versions(module: str) -> dict[str, str]:
 
 def installed() -> dict[str, str]:
     """Versions for people: of Python and of :data:`NAMED`; no stage depends on this."""
-    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in NAMED}
+    return {name: importlib.metadata.version(name) for name in NAMED} | {"python": platform.python_version()}
 
 
 @cache
@@ -82,16 +82,14 @@ def _kind(distribution: str) -> str:
     if distribution == "numpy":
         import numpy as np
 
-        config = np.show_config(mode="dicts")
-        found = config["SIMD Extensions"]
+        found = np.show_config(mode="dicts")["SIMD Extensions"]
         return " ".join([*found.get("baseline", ()), *found.get("found", ()), _blas("numpy")]).strip()
     if distribution == "scipy":
         return _blas("scipy")
     if distribution in KNOWN["cv2"]:
         import cv2
 
-        line: str = cv2.getCPUFeaturesLine()
-        return " ".join(word.lstrip("*") for word in line.split() if not word.endswith("?"))
+        return " ".join(word.lstrip("*") for word in cv2.getCPUFeaturesLine().split() if not word.endswith("?"))
     return ""
 
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 from rille.pipeline.engine.plain import plain, raw
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.graph import Graph, Handle
-    from rille.pipeline.engine.run import Result
+    from rille.pipeline.engine.graph import Handle
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -22,11 +21,9 @@ INTERVAL = 5.0
 
 def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
     """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``."""
-    stream = stream or sys.stderr
     if mode == "auto":
-        mode = "bar" if stream.isatty() else "plain"
-    kinds: dict[str, type[Progress]] = {"bar": Bar, "plain": Lines, "quiet": Progress}
-    return kinds[mode](stream)
+        mode = "bar" if (stream or sys.stderr).isatty() else "plain"
+    return {"bar": Bar, "plain": Lines, "quiet": Progress}[mode](stream)
 
 
 class Progress:
@@ -34,57 +31,40 @@ class Progress:
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
-        self.graph: Graph | None = None
-        self.done = 0
+        self.done, self.shown = 0, time.monotonic()
 
-    def open(self, graph: Graph) -> None:
-        """The run of a graph begins; the graph may still grow."""
-        self.graph = graph
+    def open(self) -> None:
+        """The run begins."""
 
-    def resolved(self, handle: Handle) -> None:
-        """The outcome of a node is known."""
+    def resolved(self, handle: Handle, total: int) -> None:
+        """The outcome of a node is known, of so many that are known and wanted by now."""
         self.done += 1
 
     def failed(self, label: str, error: BaseException) -> None:
         """A task or a flow failed."""
 
-    def close(self, result: Result) -> None:
+    def close(self) -> None:
         """The run has ended."""
-
-    def total(self) -> int:
-        """Nodes that are known and wanted by now."""
-        if self.graph is None:
-            return 0
-        return len(self.graph.nodes if self.graph.cut is None else self.graph.needed)
 
 
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def open(self, graph: Graph) -> None:
-        """Begin the clock."""
-        super().open(graph)
-        self.shown = time.monotonic()
-
-    def resolved(self, handle: Handle) -> None:
+    def resolved(self, handle: Handle, total: int) -> None:
         """Say at once what was compiled, and show where the run is."""
-        super().resolved(handle)
+        super().resolved(handle, total)
         if handle.took.compiling >= 1.0:
             self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
-        self._show(handle)
+        self._show(handle, total)
 
-    def _show(self, handle: Handle) -> None:
+    def _show(self, handle: Handle, total: int) -> None:
         if time.monotonic() - self.shown >= INTERVAL:
             self.shown = time.monotonic()
-            self._say(f"{self.done}/{self.total()} tasks, {handle.label} {handle.status}")
+            self._say(f"{self.done}/{total} tasks, {handle.label} {handle.status}")
 
     def failed(self, label: str, error: BaseException) -> None:
         """Say so at once."""
         self._say(f"{label} failed ({type(error).__name__})")
-
-    def close(self, result: Result) -> None:
-        """One closing line."""
-        self._say(summary(result))
 
     def _say(self, text: str) -> None:
         print(f"rille: {text}", file=self.stream, flush=True)
@@ -93,37 +73,27 @@ class Lines(Progress):
 class Bar(Lines):
     """A bar of the tasks that have ended."""
 
-    def open(self, graph: Graph) -> None:
-        """Show the bar."""
+    def __init__(self, stream: TextIO | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
-        super().open(graph)
+        super().__init__(stream)
         columns = MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         named = TextColumn("{task.description}", markup=False)
         self.rich = RichProgress(*columns, named, console=Console(file=raw(self.stream)), transient=True)
         self.task = self.rich.add_task("", total=None)
+
+    def open(self) -> None:
+        """Show the bar."""
         self.rich.start()
 
-    def _show(self, handle: Handle) -> None:
-        self.rich.update(self.task, completed=self.done, total=self.total(), description=plain(handle.label))
+    def _show(self, handle: Handle, total: int) -> None:
+        self.rich.update(self.task, completed=self.done, total=total, description=plain(handle.label))
 
-    def close(self, result: Result) -> None:
+    def close(self) -> None:
         """Take the bar away."""
-        if hasattr(self, "rich"):
-            self.rich.stop()
-        super().close(result)
+        self.rich.stop()
 
     def _say(self, text: str) -> None:
-        if hasattr(self, "rich"):
-            self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
-
-
-def summary(result: Result) -> str:
-    """``12 computed, 388 cached in 14.2 s``, with what failed or was left out."""
-    counts = result.counts
-    parts = [f"{counts['computed']} computed", f"{counts['cached']} cached"]
-    parts += [f"{counts[status]} {status}" for status in ("planned", "failed") if counts[status]]
-    parts += [f"{counts['skipped']} left out"] if counts["skipped"] else []
-    return f"{', '.join(parts)} in {result.seconds:.1f} s"
+        self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)

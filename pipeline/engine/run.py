@@ -50,10 +50,6 @@ MISSING = ("failed", "skipped", "planned")
 """Statuses of an input after which a task is not begun."""
 
 
-class WorkerDiedError(RilleError):
-    """A task took several worker processes along: out of memory, or a crash in native code."""
-
-
 @dataclass(frozen=True)
 class Failure:
     """A task that failed: its label and stage, and the original exception."""
@@ -89,19 +85,13 @@ class Result:
 
         With ``holes`` failures that lie in the data are passed over.
         """
-        failures = [f for f in self.failures if not (holes and is_hole(f.error))]
+        failures = [f for f in self.failures if not (holes and isinstance(f.error, DegenerateError))]
         if failures:
-            first = failures[0]
-            error = first.error
+            first, error = failures[0], failures[0].error
             if (known := translated(error)) is not None:
                 raise known.at(first.label) from error
             text = f"{first.label} (stage {first.stage}): {type(error).__name__}: {error}"
             raise RilleError("RIL-534", text) from error
-
-
-def is_hole(error: BaseException) -> bool:
-    """Whether a failure lies in the data, so that what does not depend on it is delivered all the same."""
-    return isinstance(error, DegenerateError)
 
 
 @dataclass(frozen=True)
@@ -204,7 +194,7 @@ class _Run:
             ended: dict[str, Any] = {} if self.result.interrupted else {"ok": self.result.ok}
             if self.graph.outdated:
                 ended["outdated"] = [h.label for h in self.graph.nodes if h.index in self.graph.outdated]
-            self.progress.close(self.result)  # first: a ledger on a full disk raises
+            self.progress.close()  # first: a ledger on a full disk raises
             self.ledger.run(seconds=round(self.result.seconds, 3), **ended)
             self.ledger.close()
         return self.result
@@ -219,7 +209,7 @@ class _Run:
             self.options.kept.append(self.workers)
 
     def _loop(self, interrupts: Interrupts) -> None:
-        self.progress.open(self.graph)
+        self.progress.open()
         self.store.survey(self.graph.sequence)
         while True:
             while self._take() or self._go_on():
@@ -348,7 +338,7 @@ class _Run:
         handle.status = status
         self.ledger.write(handle)
         if handle.index not in self.before:  # a task that was computed again counts once
-            self.progress.resolved(handle)
+            self.progress.resolved(handle, len(self.graph.nodes if self.graph.cut is None else self.graph.needed))
 
     def _skip(self, handle: Handle, missing: Handle) -> None:
         planned, handle.ref = missing.status == "planned", None
@@ -375,8 +365,7 @@ class _Run:
             self._fail(handle, ended)
 
     def _succeed(self, handle: Handle, outcome: Outcome) -> None:
-        chained = not handle.key
-        if chained and all(h.done for h in handle.upstream()):
+        if not handle.key and all(h.done for h in handle.upstream()):
             refs = handle.refs()
             handle.key = key_of(handle.spec, refs)
             if not outcome.cached:
@@ -393,15 +382,15 @@ class _Run:
         handle.ref, handle.key = replace(outcome.ref, stage=handle.stage), outcome.ref.key
         self._resolve(handle, "cached" if outcome.cached else "computed")
 
-    def _culprit(self, handle: Handle, died: Died) -> WorkerDiedError:
-        """The error of a task that ran alone as its workers died."""
+    def _culprit(self, handle: Handle, died: Died) -> RilleError:
+        """The error of a task that ran alone as its workers died: out of memory, or a crash in native code."""
         at = f"; the last was ended at {died.memory}" if died.memory else ""
         needs = memory.words(self.estimates.task(handle))
         text = f"{died.workers} worker processes died while they ran it alone{at} (it is estimated to need {needs})"
         lower = handle.spec.stage.memory.lower
         change = f"change {' or '.join(lower)}, " if lower and died.memory else ""
         remedy = f"{change}give it more memory with fewer --jobs, or run it with --executor inline to see the crash"
-        return WorkerDiedError("RIL-586", text, remedy=remedy)
+        return RilleError("RIL-586", text, remedy=remedy)
 
     def _heal(self, handle: Handle, error: BaseException) -> bool:
         """Have inputs that were damaged or gone when a task read them computed again, and the task after them."""
@@ -429,7 +418,8 @@ class _Run:
     def _failed(self, failure: Failure) -> None:
         self.result.failures.append(failure)
         self.progress.failed(failure.label, failure.error)
-        if not self.options.keep_going and not is_hole(failure.error):
+        # A failure that lies in the data is a hole: what does not depend on it is delivered all the same.
+        if not self.options.keep_going and not isinstance(failure.error, DegenerateError):
             self.stopped = f"stopped after {failure.label} failed"
             self.in_flight.clear()
             self.calls.clear()

@@ -18,12 +18,11 @@ from rille.pipeline.engine.runtime.kernels import COMPILING
 from rille.pipeline.engine.spec import Refs, Spec, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
-from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.core.declare import check_outputs
 from rille.stages.core.errors import RilleError
 
-TRIES = 3
-BACK_OFF = 0.2
-"""Seconds before the second try; four times as long before the third."""
+PAUSES_SECONDS = 0.2, 0.8
+"""Before the second try, and before the third."""
 
 PERMANENT = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
@@ -55,7 +54,7 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
     if key is not None and key != own:
         raise code_changed()
     store = Store(root)
-    for trial in range(TRIES):
+    for pause in (*PAUSES_SECONDS, None):
         try:
             ref = None if force else store.lookup(spec.stage.name, own)
             if ref is not None:
@@ -67,9 +66,9 @@ def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, 
             )
         except OSError as error:
             # A missing file does not appear by waiting; a network drive that stumbled recovers.
-            if isinstance(error, PERMANENT) or trial == TRIES - 1:
+            if pause is None or isinstance(error, PERMANENT):
                 raise
-            time.sleep(BACK_OFF * 4**trial)
+            time.sleep(pause)
     raise AssertionError("unreachable")
 
 
@@ -80,8 +79,6 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
     begin = time.perf_counter()
     result = stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
     kernel = time.perf_counter() - begin
-    if not isinstance(result, Bundle):
-        raise TypeError(f"{stage.name}: run gave a {type(result).__name__}, not a Bundle")
     # Before anything is stored: a wrong dtype or shape would be found by the next stage, under this key, for ever.
     check_outputs(stage, result)
     provenance = {

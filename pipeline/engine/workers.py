@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import psutil
 
@@ -40,7 +40,7 @@ from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Spec, flatten_ports, map_ports
+from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, ensure
 from rille.stages.core.errors import ConfigError, RilleError
@@ -81,12 +81,7 @@ class Call:
         """Run it here, with the artifacts of the calls that it waited for, unless one did not come."""
         if not made.keys() >= {*self.upstream()}:
             return NotBegun()
-
-        def ref(given: Any) -> Ref:
-            found: Ref = made[given] if isinstance(given, int) else given
-            return found
-
-        refs = map_ports(ref, self.refs)
+        refs = cast(Refs, map_ports(lambda given: made[given] if isinstance(given, int) else given, self.refs))
         try:
             return ensure(self.root, self.spec, refs, key=self.key or None, force=self.force)
         except Exception as error:

@@ -65,13 +65,12 @@ class Output:
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
     """Stage of some outputs; their module declares it as ``STAGE``, so that the stage's code is that of the module."""
-    writers = {output.name: output.write for output in outputs}
+    writers = {output.name: output.write for output in outputs if output.write is not None}
 
     def run(params: NoParams, args: Mapping[str, Any], inputs: Mapping[str, Any]) -> Bundle:
-        write, bundles = writers[args["file"]], [Bundle(_Unkept(b), b.meta) for b in inputs["read"]]
-        assert write is not None
+        bundles = [Bundle(_Unkept(b), b.meta) for b in inputs["read"]]
         with TemporaryDirectory() as folder:
-            write(Path(folder) / args["file"], _restored(args["run"], bundles))
+            writers[args["file"]](Path(folder) / args["file"], _restored(args["run"], bundles))
             return pack(Path(folder))
 
     return Stage(name, 1, summary, NoParams, ("read*",), (CONTENT,), run, Memory(fixed=300e6, factor=1.0, result=0.1))

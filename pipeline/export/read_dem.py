@@ -36,8 +36,6 @@ MAX_CELLS = 500_000_000
 
 OURS = "give a run as Rille writes it"
 
-NO_PLACE = "give a raster that says itself where its cells are"
-
 TIFF = (b"II", b"MM")
 """First bytes of a TIFF; any other file is read as an ESRI ASCII grid."""
 
@@ -98,8 +96,7 @@ def read_elevation(path: Path) -> DemFile:
 
 def _check_known(path: Path, grid: Grid) -> None:
     if not np.isfinite(grid.values).any():
-        text = f"{path} has no known cell among {grid.values.size}"
-        raise InputError("RIL-628", text, remedy="give another")
+        raise InputError("RIL-628", f"{path} has no known cell among {grid.values.size}", remedy="give another")
 
 
 def _without_marks(dem: DemFile) -> DemFile:
@@ -245,7 +242,8 @@ def _check_cells(path: Path, shape: tuple[int, ...]) -> None:
 def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
     """WKT of the CRS of a raster, empty if it states none."""
     if transform == Affine.identity():
-        raise InputError("RIL-630", f"{path} has no geotransform", remedy=NO_PLACE)
+        remedy = "give a raster that says itself where its cells are"
+        raise InputError("RIL-630", f"{path} has no geotransform", remedy=remedy)
     if crs is None:
         return ""
     if crs.is_geographic:
@@ -255,8 +253,7 @@ def _checked_system(path: Path, transform: Affine, crs: Any) -> str:
     unit, factor = crs.linear_units_factor if crs.is_projected else ("metre", 1.0)
     if factor != 1.0:
         raise InputError("RIL-634", f"{path} has coordinates in {unit} of {factor:.6g} m", remedy="give one in metres")
-    wkt: str = crs.to_wkt(version="WKT2_2019")
-    return wkt
+    return str(crs.to_wkt(version="WKT2_2019"))
 
 
 def crs_name(wkt: str) -> str:
@@ -311,7 +308,8 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
     if not all((run / name).exists() for name in ("trajectory.kitti", "frames.json")):
         return None
     # Read outside of the try: an unreadable file is an error, while one with other content just has no cameras.
-    lines, frames = read_lines(run / "trajectory.kitti", "trajectory"), _frames(run / "frames.json")
+    lines = read_lines(run / "trajectory.kitti", "trajectory")
+    frames = read_text(run / "frames.json", "frames.json", TABLE)
     try:
         poses, place = np.loadtxt(lines, ndmin=2), georeference_in(json.loads(frames))
         centres = poses[:, [3, 7, 11]][np.isfinite(poses[:, 3])]
@@ -322,11 +320,7 @@ def _cameras(run: Path) -> NDArray[np.float64] | None:
 
 def frames_of(path: Path) -> dict[str, Any]:
     """Content of a run's ``frames.json``; empty if there is none."""
-    return dict(json.loads(_frames(path))) if path.exists() else {}
-
-
-def _frames(path: Path) -> str:
-    return read_text(path, "frames.json", TABLE)
+    return dict(json.loads(read_text(path, "frames.json", TABLE))) if path.exists() else {}
 
 
 def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
@@ -335,35 +329,24 @@ def georeference_in(frames: Mapping[str, Any]) -> Georeference | None:
     return None if stated is None else Georeference.from_dict(stated)
 
 
-def refuse_irregular(top: Path) -> None:
-    """Refuse a file or folder of a run that is, or holds, a link, a pipe or a device.
-
-    Raises
-    ------
-    InputError
-        It does; Rille writes none, and the target of a link is no part of the run.
-    """
-    below = (Path(entry.path) for _, entries in Search().below(top, hidden=True) for entry in entries)
-    for path in (top, *below):
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise InputError("RIL-723", f"{path} is no regular file", remedy=OURS)
-
-
 def check_group(path: Path) -> None:
-    """Refuse a zarr group with larger axes or chunks than Rille writes, with other codecs, or with pipes.
+    """Refuse a zarr group with larger axes or chunks than Rille writes, with other codecs, or with links or pipes.
 
     Raises
     ------
     InputError
-        It has such an array, or one that might unpack to any size, or a file that is not regular, such as a pipe, for
-        which zarr would wait for ever.
+        It has such an array, or one that might unpack to any size, or a link, or a pipe, for which zarr would wait for
+        ever.
     ValueError, OSError, KeyError, TypeError
         It is no zarr group.
     """
     import zarr
     from zarr.storage import LocalStore
 
-    refuse_irregular(path)
+    # Rille writes none of these, and the target of a link is no part of the run.
+    for file in (path, *(Path(entry.path) for _, entries in Search().below(path, hidden=True) for entry in entries)):
+        if file.is_symlink() or not (file.is_file() or file.is_dir()):
+            raise InputError("RIL-723", f"{file} is no regular file", remedy=OURS)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
         # 10_000_000: longest axis, because coordinates are always read whole.
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:

@@ -9,6 +9,7 @@ from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, artifact
 from rille.pipeline.export.writers import FRAME, WORLDS, write_table, write_trajectory_kitti, write_trajectory_tum
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -19,22 +20,15 @@ def stamps(run: RunView) -> list[float]:
     return [float(f) if times is None else times[f] for f in run.frames]
 
 
-def _world(trajectory: Bundle, piece: int) -> str:
-    """Frame of a piece in words."""
-    return WORLDS.get(trajectory.meta["verticals"][piece], FRAME)
-
-
 def _trajectory(run: RunView) -> Bundle:
     return artifact(run, run.products.trajectory)
 
 
-def _write_kitti(path: Path, run: RunView) -> None:
-    write_trajectory_kitti(path, world_poses(_trajectory(run)))
-
-
-def _write_tum(path: Path, run: RunView) -> None:
-    trajectory = _trajectory(run)
-    write_trajectory_tum(path, world_poses(trajectory), stamps(run), _world(trajectory, trajectory.meta["main"]))
+def _write_tum(path: Path, run: RunView, poses: Floats, piece: int | None = None) -> None:
+    """Write poses in the frame of a piece of the trajectory; None: of the main one."""
+    facts = _trajectory(run).meta
+    vertical = facts["verticals"][facts["main"] if piece is None else piece]
+    write_trajectory_tum(path, poses, stamps(run), WORLDS.get(vertical, FRAME))
 
 
 def _write_pieces(path: Path, run: RunView) -> None:
@@ -42,16 +36,11 @@ def _write_pieces(path: Path, run: RunView) -> None:
     for number in range(len(trajectory.meta["verticals"])):
         if number != trajectory.meta["main"]:
             piece = path.with_name(path.name.replace("*", str(number + 1)))
-            write_trajectory_tum(piece, world_poses(trajectory, number), stamps(run), _world(trajectory, number))
+            _write_tum(piece, run, world_poses(trajectory, number), number)
 
 
 def _compared(run: RunView) -> CrosscheckComparison:
     return compare(run, artifact(run, run.products.agreement))
-
-
-def _write_crosscheck(path: Path, run: RunView) -> None:
-    trajectory = _trajectory(run)
-    write_trajectory_tum(path, _compared(run).poses, stamps(run), _world(trajectory, trajectory.meta["main"]))
 
 
 def _write_agreement(path: Path, run: RunView) -> None:
@@ -86,7 +75,7 @@ OUTPUTS = (
         "trajectory.kitti",
         "pose of each left camera, a 3 x 4 matrix a line, world from camera, m",
         "evo (evo_traj kitti), any text editor",
-        _write_kitti,
+        lambda path, run: write_trajectory_kitti(path, world_poses(_trajectory(run))),
         "world",
         _posed,
     ),
@@ -94,7 +83,7 @@ OUTPUTS = (
         "trajectory.tum",
         "the same as time, position and quaternion x y z w",
         "evo (evo_traj tum), CloudCompare",
-        _write_tum,
+        lambda path, run: _write_tum(path, run, world_poses(_trajectory(run))),
         "world",
         _posed,
         _times,
@@ -111,7 +100,7 @@ OUTPUTS = (
         "crosscheck.tum",
         "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
-        _write_crosscheck,
+        lambda path, run: _write_tum(path, run, _compared(run).poses),
         "world",
         _agreed,
         _beside,

@@ -103,6 +103,5 @@ def _truth_dem(
     T_truth_left, exact = _truth(make, pair), make.sequence.truth_dem
     assert T_truth_left is not None
     assert exact is not None
-    T_local_left = RigidTransform.from_matrix(level.meta["T_local_left"])
-    T_truth_local = T_truth_left @ T_local_left.inverse()
+    T_truth_local = T_truth_left @ RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
     return make.source(exact(lattice.to_dict(), T_truth_local, seen_by), f"truth_dem/{scope}/{pair}")

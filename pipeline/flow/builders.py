@@ -8,7 +8,7 @@ from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.pipeline.engine.graph import Graph, Handle
@@ -20,15 +20,9 @@ from rille.stages.calibration.orientation import orientation_stage
 from rille.stages.calibration.rig import rig_stage
 from rille.stages.calibration.swap_check import swap_check_stage
 from rille.stages.calibration.synchrony import synchrony_stage
-from rille.stages.core.declare import F, NoParams, Params, Stage
+from rille.stages.core.declare import F, NoParams, Stage
 from rille.stages.core.errors import ConfigError
-from rille.stages.facts.calibration import (
-    CalibrationFacts,
-    OrientationFacts,
-    RigFacts,
-    SwapFacts,
-    SynchronyFacts,
-)
+from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
 from rille.stages.facts.imaging import PyramidFacts, QualityFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
@@ -94,8 +88,7 @@ def once(make: Callable[Concatenate[Builder, P], T]) -> Callable[Concatenate[Bui
         name = (make.__name__, *args, *kwargs.items())
         if name not in self.made:
             self.made[name] = make(self, *args, **kwargs)
-        found: T = self.made[name]
-        return found
+        return cast(T, self.made[name])
 
     return made
 
@@ -142,10 +135,9 @@ class Builder:
         return {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()} or None
 
     @cached_property
-    def given_vehicle(self) -> dict[str, Any]:
+    def given_vehicle(self) -> Any:
         """The vehicle without its name, which changes no result."""
-        found: dict[str, Any] = self.config.vehicle.model_dump(mode="json", exclude={"name"})
-        return found
+        return self.config.vehicle.model_dump(mode="json", exclude={"name"})
 
     def node(self, stage: Stage[Any, F], label: str, params: Any = None, /, **given: Any) -> Handle[F]:
         """One task of a stage, with the parameters that it has in the configuration, or with others.
@@ -153,8 +145,7 @@ class Builder:
         ``given`` are its inputs (handles) and arguments; None stands for one that is absent.
         """
         # A section is named as its stage; a stage without parameters has none.
-        chosen: Params = params or getattr(self.config, stage.name, NO_PARAMS)
-        return self.graph.call(stage, label, chosen, **given)
+        return self.graph.call(stage, label, params or getattr(self.config, stage.name, NO_PARAMS), **given)
 
     def recalibrate(self, correction: list[float], since: int) -> None:
         """Correct the calibration; tasks that do not depend on it are laid out as before."""
@@ -188,8 +179,7 @@ class Builder:
         label = source.module.rsplit(".", 1)[-1]
         if label not in self.made:
             self.made[label] = self.source(source, label)
-        found: Handle = self.made[label]
-        return found
+        return cast(Handle, self.made[label])
 
     @once
     def raw_image(self, frame: int, camera: str) -> Handle:

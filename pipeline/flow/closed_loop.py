@@ -181,11 +181,6 @@ class Drive:
         self.planned: Handle | None = None
         self.troubles = 0
 
-    def build(self) -> Products:
-        """Lay out the start; the rest follows as results arrive."""
-        self.graph.flow(self.steps())
-        return self.products
-
     def steps(self) -> Generator[Wait, Any, None]:
         """The drive, and its assessment."""
         try:
@@ -218,7 +213,11 @@ class Drive:
         while True:
             stop = self._look(at)
             if stop.index == 0 and self.config.drive.frame == "map":
-                self._on_the_map((yield from done(self._fix())))
+                # The frame of the first pair is the world.
+                T_global_world = (yield from done(self._fix())).meta["T_global_local"]
+                given = [*self.config.drive.goal, T_global_world[11]]
+                x, y, _ = RigidTransform.from_matrix(T_global_world).inverse().apply(given)
+                self.goal = self._on_ground(float(x), float(y))
             yield from self._think(stop, self._map(stop))
             way = yield from self._drive(stop, at)
             at = yield from self._judge(stop, way)
@@ -259,12 +258,6 @@ class Drive:
         self.driven.fix = self.make.node(map_localization_stage, "map_localization", **given)
         return self.driven.fix
 
-    def _on_the_map(self, fixed: Ref[MapFixFacts]) -> None:
-        """The goal in the world frame, which is the local frame of the first pair."""
-        T_world_map = RigidTransform.from_matrix(fixed.meta["T_global_local"]).inverse()
-        x, y, _ = T_world_map.apply([*self.config.drive.goal, fixed.meta["T_global_local"][11]])
-        self.goal = self._on_ground(float(x), float(y))
-
     def _on_ground(self, x: float, y: float) -> tuple[float, float]:
         """Return a goal in the world frame; refuse one beside the ground."""
         x_min, x_max, y_min, y_max = self.simulation.ground
@@ -303,7 +296,11 @@ class Drive:
             finest = self.config.vehicle.wheel_diameter / self.config.drive.detail
             near = self._merged(f"merge/{k}/near", finest)
             stop.risk = make.hazards(f"risk/{k}/near", [near])
-        return self._ceiling(f"occlusion_bounds/{k}", near, finest)
+        # Also where it was not seen.
+        bounds = self.config.occlusion_bounds
+        bounds = bounds if finest is None else bounds.model_copy(update={"max_footprint": finest})
+        dems = list(p.world_dem.values())
+        return make.node(occlusion_bounds_stage, f"occlusion_bounds/{k}", bounds, merged=near, dems=dems)
 
     def _located(self, legs: int) -> Handle[TrajectoryFacts]:
         """The trajectory over so many legs, which becomes that of the drive."""
@@ -324,12 +321,6 @@ class Drive:
         dems = [*self.pads, *self.products.world_dem.values()]
         return self.make.node(merge_stage, label, params, dems=dems, lattice=self.arena().to_dict())
 
-    def _ceiling(self, label: str, merged: Handle, finest: float | None) -> Handle:
-        """Upper bounds of the ground, also where it was not seen."""
-        params = self.config.occlusion_bounds.model_copy(update={} if finest is None else {"max_footprint": finest})
-        dems = list(self.products.world_dem.values())
-        return self.make.node(occlusion_bounds_stage, label, params, merged=merged, dems=dems)
-
     def arena(self) -> Lattice:
         """The part of the world that is mapped."""
         return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
@@ -337,16 +328,14 @@ class Drive:
     def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
         """Plan the next leg; plan again while a way turns out to be closed."""
         known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
-        follows, label, thoughts = "again", f"leg/{stop.index}", 0
+        known |= {"before": self.planned, "driven": self.products.trajectory}
+        follows, thoughts = "again", 0
         while follows == "again":
-            driven = self.products.trajectory
-            stop.leg = self._leg(label, self.memory, {}, before=self.planned, driven=driven, **known)
+            label = f"leg/{stop.index}/{thoughts}" if thoughts else f"leg/{stop.index}"
+            stop.leg = self._leg(label, self.memory, {}, **known)
             leg = (yield stop.leg).meta
-            where = None if leg["where"] is None else tuple(leg["where"])
-            follows = self.memory.after(leg["verdict"], where)
-            if follows == "again":
-                thoughts += 1
-                label = f"leg/{stop.index}/{thoughts}"
+            follows = self.memory.after(leg["verdict"], leg["where"] and tuple(leg["where"]))
+            thoughts += 1
         if follows == "end":
             stop.event = leg["reason"]
             raise EndedError(leg["verdict"], leg["reason"])
@@ -552,7 +541,8 @@ def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, .
     name_graph(graph, sequence, frames)
     if sequence.simulation is not None:
         drive = Drive(graph, sequence, config)
-        return drive.build(), drive
+        graph.flow(drive.steps())
+        return drive.products, drive
     make = Builder(graph, sequence, config)
     graph.flow(reconstruction(make, frames))
     return make.products, None

@@ -166,7 +166,7 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
         intrinsics=p.intrinsics,
         frames=list(frames),
         steps=step_measures(make, chosen),
-        lost=sorted([*missing, *fitting.lost], key=lambda item: item["frame"]) or None,
+        lost=sorted([*missing, *fitting.choice.lost], key=lambda item: item["frame"]) or None,
     )
     yield from adjusted(make, frames, list(pairs.values()))
     assessment.of_trajectory(make, frames)
@@ -181,11 +181,10 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
 class Tracked:
     """Basic pairs that fit each other, with their disparities (``matched``) and the tracks from each to the next.
 
-    ``lost``: frames (frame and cause); ``moved``: pairs after a knock of the rig.
+    ``moved``: pairs after a knock of the rig.
     """
 
     choice: Choice
-    lost: list[dict[str, Any]]
     matched: dict[int, BasicPair]
     segments: list[Segment]
     moved: set[int]
@@ -203,8 +202,7 @@ def tracked(
     while True:
         if attempt and p.crosscheck is not None:
             p.crosscheck = crosscheck_tasks(make, whole)
-        found = yield from simultaneous(make, frames, whole, screening, refused | (torn or {}))
-        choice = found.choice
+        choice = yield from simultaneous(make, frames, whole, screening, refused | (torn or {}))
         if choice is None:
             return None
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
@@ -217,11 +215,11 @@ def tracked(
             continue
 
         # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
-        runs = [[found.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
+        runs = [[choice.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
         segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
         segments, moved = yield from refuse_knocked(make, matched, segments)
         p.resections = [s.resection for s in segments]
-        wanted = suspects(segments, found.chain) if torn is None else confirmed(segments, found.chain, torn)
+        wanted = suspects(segments, choice.chain) if torn is None else confirmed(segments, choice.chain, torn)
         if wanted != (torn or {}):
             torn = wanted
             make.discard(since)
@@ -231,7 +229,7 @@ def tracked(
         if correction is None or attempt == MAX_CALIBRATIONS:
             if p.intrinsics is not None:
                 p.contradictions.append(p.intrinsics)
-            return Tracked(choice, found.lost, matched, segments, moved)
+            return Tracked(choice, matched, segments, moved)
         make.recalibrate(correction["corrected"], since)
         attempt += 1
 
@@ -329,21 +327,28 @@ def screened(make: Builder, whole: list[int], timed: bool = False) -> Generator[
 
 @dataclass(frozen=True)
 class Choice:
-    """Basic pairs, the rig of each, and the facts of these rigs.
+    """Basic pairs of a ``chain`` of frames: the rig of each, and the facts of these rigs.
 
-    ``suspects``: pairs whose rows the rig does not explain; ``which``: end of the labels of its tasks.
+    ``lost``: frames (frame and cause); ``suspects``: pairs whose rows the rig does not explain; ``which``: end of the
+    labels of its tasks.
     """
 
     which: str
+    chain: list[int]
+    lost: list[dict[str, Any]]
     keyframes: Ref[KeyframesFacts]
-    basic: list[int]
     rigs: dict[int, Handle[CalibrationFacts]]
     judged: list[Ref[RigFacts]]
     suspects: list[int]
 
+    @property
+    def basic(self) -> list[int]:
+        """Basic pairs, in order."""
+        return list(self.rigs)
+
 
 def basic_pairs(
-    make: Builder, chain: list[int], unfit: set[int], behind: list[int], mode: str
+    make: Builder, chain: list[int], lost: list[dict[str, Any]], unfit: set[int], behind: list[int], mode: str
 ) -> Generator[Wait, Any, Choice]:
     """Choose basic pairs of a ``chain`` of frames, and estimate their rigs: one for all pairs, or one each (``mode``).
 
@@ -368,14 +373,7 @@ def basic_pairs(
     p.rigs, known = {k: one[0] for k, one in rigs.items()}, {k: one[1] for k, one in rigs.items()}
     judged: list[Ref[RigFacts]] = yield list(dict.fromkeys(p.rigs.values()))
     suspects = [pair for one in judged for pair in one.meta.get("suspects", ())]
-    return Choice(which, chosen, basic, known, judged, suspects)
-
-
-def compare_times(make: Builder, choice: Choice, chain: list[int]) -> Generator[Wait, Any, Ref[SynchronyFacts]]:
-    """Compare suspect pairs, 12 at most, with right images of other times."""
-    asked = make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain)
-    make.products.contradictions.append(asked)
-    return (yield from done(asked))
+    return Choice(which, chain, lost, chosen, known, judged, suspects)
 
 
 def misfits(choice: Choice, mode: str) -> set[int]:
@@ -388,24 +386,14 @@ def misfits(choice: Choice, mode: str) -> set[int]:
     return alone if 4 * len(bad) <= len(basic) else set()
 
 
-@dataclass(frozen=True)
-class Simultaneous:
-    """Frames of the ``chain``, ``lost`` frames (frame and cause), and the choice of basic pairs (None: nothing can be
-    measured)."""
-
-    chain: list[int]
-    lost: list[dict[str, Any]]
-    choice: Choice | None
-
-
 def simultaneous(
     make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
-) -> Generator[Wait, Any, Simultaneous]:
+) -> Generator[Wait, Any, Choice | None]:
     """Choose basic pairs; leave out those whose rigs or images contradict the others, and choose again.
 
     Frames are lost that the screening ``found``, that are ``odd`` (cause by frame), and whose left and right images do
     not fit each other though those of their neighbours do. If some pairs are of two times, all frames are screened
-    again. No choice if the images of most pairs contradict the rig, or each other.
+    again. None if the images of most pairs contradict the rig, or each other.
     """
     p, mode, wrong = make.products, make.config.rig.mode, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
@@ -416,9 +404,11 @@ def simultaneous(
         late = found.meta.get("late", [])
         if late and not p.contradictions:
             p.contradictions.append(synchrony_of_late(make, late, whole))
-        choice = yield from basic_pairs(make, chain, {*wrong, *found.meta["unfit"]}, behind, mode)
+        choice = yield from basic_pairs(make, chain, lost, {*wrong, *found.meta["unfit"]}, behind, mode)
         if choice.suspects:
-            apart = yield from compare_times(make, choice, chain)
+            # Suspect pairs, 12 at most, are compared with right images of other times.
+            p.contradictions.append(make.synchrony(f"synchrony{choice.which}", spread(choice.suspects, 12), chain))
+            apart: Ref[SynchronyFacts] = yield p.contradictions[-1]
             partners = apart.meta["partners"]
             if partners and not timed:
                 # All frames, not basic pairs alone: after a lost image no pair is of one time.
@@ -435,7 +425,7 @@ def simultaneous(
                 p.rigs = {} if partners else p.rigs
                 if late and partners:
                     p.contradictions[:] = [synchrony_of_late(make, sorted({*late, *(k for k, _ in partners)}), whole)]
-                return Simultaneous(chain, lost, None)
+                return None
             if partners:
                 wrong |= {pair for pair, _ in partners}
                 continue
@@ -449,7 +439,7 @@ def simultaneous(
             # One calibration does not describe this rig: each pair has its own.
             mode = "per_pair"
         else:
-            return Simultaneous(chain, lost, choice)
+            return choice
 
 
 def resected(segments: list[Segment]) -> list[ResectFacts]:
@@ -533,14 +523,9 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
 
 
 def vertical(make: Builder, pair: int) -> dict[str, Any]:
-    """Collect the known facts about the vertical of a pair (attitude, pitch) as arguments of a stage."""
-    s, args = make.sequence, dict[str, Any]()
-    up = None if s.up is None else s.up[pair]
-    if up is not None:
-        args["up"] = list(up)
-    if s.pitch is not None:
-        args["pitch"] = s.pitch
-    return args
+    """The facts about the vertical of a pair (attitude, pitch) as arguments of a stage, None where not known."""
+    up = make.sequence.up and make.sequence.up[pair]
+    return {"up": up and list(up), "pitch": make.sequence.pitch}
 
 
 def refuse_knocked(
@@ -581,9 +566,9 @@ def sensors(make: Builder, frames: Series[int]) -> dict[str, Any]:
     said: dict[str, Any] = {name: dict(fact) for name, fact in s.priors.items()}
     rows = {"odometry": ("poses", s.odometry), "attitude": ("rotations", s.attitude), "up": ("directions", s.up)}
     for name, (key, known) in rows.items():
-        if name in said and known is None:
-            del said[name]
-        elif name in said and known is not None:
+        if known is None:
+            said.pop(name, None)
+        elif name in said:
             one = [known[f] for f in frames]
             said[name][key] = [v.to_list() if isinstance(v, RigidTransform) else v for v in one]
     times = list(frames) if s.times is None else [s.times[f] for f in frames]

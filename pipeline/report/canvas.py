@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageColor
 from pydantic import TypeAdapter
 
 from rille.pipeline.export.rasters import CLASSES
@@ -115,8 +116,6 @@ def encode(fig: Any, alt: str, *, photo: bool = False) -> Panel:
     out = io.BytesIO()
     if photo:
         fig.savefig(out, format="webp", dpi=PIXELS_PER_INCH, pil_kwargs={"quality": 85})
-        from PIL import Image
-
         inches = [n / PIXELS_PER_INCH for n in Image.open(out).size]
     else:
         # No date and no version of matplotlib in it: equal figures make equal files.
@@ -151,7 +150,5 @@ def ramp() -> NDArray[np.uint8]:
 
 def paint(classes: NDArray[np.uint8], *colors: str) -> NDArray[np.uint8]:
     """Colours (row, col, 3) of classes 0, 1, 2 ..."""
-    from PIL import ImageColor
-
     table = np.array([ImageColor.getrgb(c) for c in colors], dtype=np.uint8)
     return np.asarray(table[np.minimum(classes, len(colors) - 1)])

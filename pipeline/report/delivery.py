@@ -186,12 +186,7 @@ def _local_paths(pairs: Rows) -> Items:
     return [_item("no local path", f"No local path from {asked - reached} of {asked} stops", why)] if why else []
 
 
-def on_plane(view: RunView) -> bool:
-    """Whether elevations are distances from a plane that is no ground."""
-    return bool(_on_planes(view))
-
-
-def _on_planes(view: RunView) -> list[Mapping[str, Any]]:
+def on_planes(view: RunView) -> list[Mapping[str, Any]]:
     """Facts on the plane of each pair whose elevations are distances from one that is no ground."""
     shown = [facts_of(view, level) for level in view.products.level.values()]
     return [facts for facts in shown if facts.get("source") == REFERENCE_PLANE]
@@ -199,7 +194,7 @@ def _on_planes(view: RunView) -> list[Mapping[str, Any]]:
 
 def _reference(view: RunView) -> Items:
     """State that neither hazards nor paths were asked for, and why."""
-    planes = _on_planes(view)
+    planes = on_planes(view)
     if not planes:
         return []
     first = planes[0]
@@ -265,7 +260,7 @@ def _path(view: RunView) -> Items:
         # No answer: a drive is asked for its goal, and all that it did not come to is missing with that.
         return [] if drive.verdict == "goal" else [_item("drive", f"Drive: {drive.verdict}", drive.reason)]
     path = view.bundle(view.products.world_path)
-    if on_plane(view):
+    if on_planes(view):
         return []
     if path is None:
         return [_item("no path", "No path", "the path over the merged terrain was not computed")]

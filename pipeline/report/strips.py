@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from rille.pipeline.export import artifacts
+from rille.pipeline.export.view import artifact
+from rille.pipeline.flow.products import Stop
 from rille.pipeline.report import canvas, gather, ranges
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
@@ -23,12 +26,6 @@ from rille.stages.core.quantities import metres
 from rille.stages.core.validity import matched
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import grey_bytes
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
-    from rille.pipeline.flow.products import Stop
-
 
 BUDGET_CHARACTERS = 900_000
 """All pictures of a strip together: the page has 5 MB at most."""
@@ -72,15 +69,13 @@ def depth_band(rig: Rig) -> tuple[str, int]:
     return band, 1 if along >= 0 else -1
 
 
-def risk_picture(risk: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
+def risk_picture(risk: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:
     """Classes of a risk map in their colours, and lines on them; ``width`` in pixels."""
-    from PIL import Image
-
     picture = Image.fromarray(canvas.paint(risk.arrays["risk"], *canvas.RISK)).convert("RGBA")
     return _with_lines(picture, risk, lines, width)
 
 
-def panel(picture: Image, alt: str, *, frame: int = -1, quality: int = 82) -> Panel:
+def panel(picture: Image.Image, alt: str, *, frame: int = -1, quality: int = 82) -> Panel:
     """A picture as a panel, with two pixels to a CSS pixel."""
     uri = canvas.compressed(picture, "webp", quality=quality, method=2)
     return Panel(uri, alt, picture.width // 2, picture.height // 2, frame)
@@ -102,8 +97,7 @@ def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[P
 
 def _pair(scene: Scene, pair: int, width: int) -> Panel:
     view = scene.view
-    bundle, image = view.bundle(view.products.disparity[pair]), artifacts.image(view, pair)
-    assert bundle is not None
+    bundle, image = artifact(view, view.products.disparity[pair]), artifacts.image(view, pair)
     band, sign = depth_band(view.sequence.rig)
     there = matched(np.asarray(bundle["validity"]))
     seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))
@@ -124,8 +118,7 @@ def _pair(scene: Scene, pair: int, width: int) -> Panel:
 
 def _stop(scene: Scene, stop: Stop, width: int) -> Panel:
     view, track = scene.view, scene.track
-    leg, image = view.bundle(stop.leg), view.bundle(view.products.images.get(stop.frame))
-    assert leg is not None
+    leg, image = artifact(view, stop.leg), view.bundle(view.products.images.get(stop.frame))
     risk = gather.terrain(view.bundle(stop.risk), "risk")
     dem = gather.terrain(view.bundle(stop.risk if stop.far is None else stop.far), "elevation")
     assert risk is not None
@@ -144,9 +137,7 @@ def _stop(scene: Scene, stop: Stop, width: int) -> Panel:
 # -- pictures of a column
 
 
-def _column(pictures: Sequence[Image], alt: str, frame: int) -> Panel:
-    from PIL import Image
-
+def _column(pictures: Sequence[Image.Image], alt: str, frame: int) -> Panel:
     gap, width = 4, max(p.width for p in pictures)
     whole, top = Image.new("RGBA", (width, sum(p.height + gap for p in pictures) - gap)), 0
     for picture in pictures:
@@ -155,26 +146,20 @@ def _column(pictures: Sequence[Image], alt: str, frame: int) -> Panel:
     return panel(whole, alt, frame=frame, quality=72)
 
 
-def _photo(pixels: NDArray[np.uint8], width: int) -> Image:
-    from PIL import Image
-
+def _photo(pixels: NDArray[np.uint8], width: int) -> Image.Image:
     return _scaled(Image.fromarray(pixels), width).convert("RGBA")
 
 
-def _scaled(picture: Image, width: int) -> Image:
+def _scaled(picture: Image.Image, width: int) -> Image.Image:
     """As wide as the column, or less wide where it would become too high."""
-    from PIL import Image
-
     # 1.2: bound of the shape of one picture of a column.
     factor = min(width / picture.width, 1.2 * width / picture.height)
     size = (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
     return picture.resize(size, Image.Resampling.BOX if factor < 1 else Image.Resampling.NEAREST)
 
 
-def _matches(photo: Image, disparity: Floats, there: NDArray[np.bool_]) -> Image:
+def _matches(photo: Image.Image, disparity: Floats, there: NDArray[np.bool_]) -> Image.Image:
     """Disparities (row, col) in colour on the image; pixels that were not matched stay grey."""
-    from PIL import Image
-
     low, high = ranges.limits(np.where(there, disparity, np.nan))
     # The pixel in the middle of each of the small picture's.
     at = np.ix_(
@@ -186,9 +171,7 @@ def _matches(photo: Image, disparity: Floats, there: NDArray[np.bool_]) -> Image
     return Image.fromarray(np.where(there[at][..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
 
 
-def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
-    from PIL import Image
-
+def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:
     elevation = dem.arrays["elevation"]
     low, high = ranges.ground_limits(elevation)
     alpha = np.where(np.isfinite(elevation), 255, 0).astype(np.uint8)
@@ -200,10 +183,8 @@ def _colors(share: Floats) -> NDArray[np.uint8]:
     return np.asarray(canvas.ramp()[np.clip(np.nan_to_num(share) * 255, 0, 255).astype(np.uint8)])
 
 
-def _with_lines(picture: Image, ground: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image:
+def _with_lines(picture: Image.Image, ground: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:
     """A picture of all cells, scaled to ``width``, with lines that have a white casing."""
-    from PIL import ImageDraw
-
     factor, picture = 1 / picture.width, _scaled(picture, width)
     factor *= picture.width
     pen = ImageDraw.Draw(picture)

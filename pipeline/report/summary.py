@@ -123,7 +123,7 @@ def given_numbers(view: RunView) -> list[str]:
     """
     trajectory, rig = view.bundle(view.products.trajectory), view.sequence.rig
     levels = [view.bundle(handle) for handle in view.products.level.values()]
-    known = [cast(GroundFacts, level.meta) for level in levels if level is not None and not delivery.on_plane(view)]
+    known = [cast(GroundFacts, level.meta) for level in levels if level is not None and not delivery.on_planes(view)]
     grounds = [box for facts in known if (box := facts.get("footprint"))]
     poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
     poses = poses[rigid.posed(poses)]
@@ -297,7 +297,7 @@ def _way_words(view: RunView, length: float | None) -> str:
         drive = view.products.drive
         reason = f" ({drive.reason})" if drive.reason else ""
         return f"{drive.verdict} after {count(len(drive.stops), 'stop')}{reason}"
-    if delivery.on_plane(view):
+    if delivery.on_planes(view):
         return "distances from a plane that is no ground"
     return "no path" if length is None else f"a path of {length:.3g} m{delivery.start_words(view)}"
 
@@ -305,8 +305,7 @@ def _way_words(view: RunView, length: float | None) -> str:
 def _seams(view: RunView) -> dict[str, Any] | None:
     """The audit of seams: models, how many seams there are and the worst of them."""
     audit = facts_of(view, view.products.overlap_audit)
-    names = ("models", "seam_count", "seams")
-    return {name: audit[name] for name in names} if audit.get("seams") else None
+    return {name: audit[name] for name in ("models", "seam_count", "seams")} if audit.get("seams") else None
 
 
 def _rig(scene: Scene) -> dict[str, Any] | None:

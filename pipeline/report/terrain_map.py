@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rille.pipeline.export import colour
+from rille.pipeline.export.view import artifact
 from rille.pipeline.report import canvas, gather, ranges, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
@@ -55,7 +57,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
     # Two bytes a height; 0 is undefined.
     height = _steps(z, low, max(high - low, 1e-9), np.uint16)
     sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
-    risk, reason, p_hazard = (_of_risk(scene, name, missing)[::step, ::step] for name, missing in _RISK)
+    risk, reason, p_hazard = (_of_risk(scene.risk, world, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
     count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
     slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, np.uint8)
@@ -96,12 +98,10 @@ def _plane(world: WorldTerrain, name: str, step: int) -> Floats:
     return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
 
 
-def _of_risk(scene: Scene, name: str, missing: float) -> Floats:
+def _of_risk(risk: WorldTerrain | None, world: WorldTerrain, name: str, missing: float) -> Floats:
     """An array of the risk map on the cells of the terrain."""
-    assert scene.world is not None
-    if scene.risk is None or name not in scene.risk.arrays:
-        return np.full(scene.world.lattice.shape, missing)
-    return mosaic([(scene.risk.lattice, scene.risk.arrays[name])], missing, scene.world.lattice)
+    judged = [] if risk is None or name not in risk.arrays else [(risk.lattice, risk.arrays[name])]
+    return mosaic(judged, missing, world.lattice)
 
 
 def _steps(values: NDArray[Any], low: float, span: float, kind: type[np.uint8 | np.uint16]) -> NDArray[Any]:
@@ -123,8 +123,6 @@ def _ratios(values: Floats) -> tuple[NDArray[Any], list[float]]:
 
 def _picture(*planes: NDArray[Any]) -> str:
     """Three planes (row, col) of bytes as a picture without loss."""
-    from PIL import Image
-
     # No alpha: a canvas multiplies colours by it, and the bytes read back would be others.
     picture = Image.fromarray(np.stack([np.asarray(p, np.uint8) for p in planes], axis=-1))
     return canvas.compressed(picture, "png", compress_level=6)
@@ -132,8 +130,6 @@ def _picture(*planes: NDArray[Any]) -> str:
 
 def _ortho(scene: Scene, world: WorldTerrain, step: int) -> str:
     """The ortho image, grey or coloured, as a picture with loss."""
-    from PIL import Image
-
     look = _plane(world, "ortho", step)
     if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
         rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
@@ -171,8 +167,7 @@ def _drive(scene: Scene) -> dict[str, Any]:
     """What was driven from each stop of a drive (vertex, 2) m, by the frame that it stands at; x, y, m, of the goal."""
     legs, goal = {}, None
     for stop in gather.stops(scene.view):
-        leg = scene.view.bundle(stop.leg)
-        assert leg is not None
+        leg = artifact(scene.view, stop.leg)
         goal = [round(float(v), 4) for v in leg.meta["goal"][:2]]
         if len(leg["path"]):
             legs[str(stop.frame)] = np.round(np.asarray(leg["path"])[:, :2], 4).tolist()

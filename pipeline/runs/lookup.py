@@ -6,7 +6,6 @@ import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.plain import some
@@ -89,21 +88,6 @@ def elevation(text: str, runs: Path) -> Path:
         return find(text, runs)
     except ConfigError:
         return path  # its reader reports the error
-
-
-def row(rows: Iterable[dict[str, Any]], label: str, run: Path) -> dict[str, Any]:
-    """The last line of a task in a ledger.
-
-    Raises
-    ------
-    ConfigError
-        The run has no such task; the message has the nearest names.
-    """
-    by_label = {r["label"]: r for r in rows}
-    if label in by_label:
-        return by_label[label]
-    text = f"run {name(run)} has no task {label!r}"
-    raise ConfigError("RIL-068", text, remedy=did_you_mean(label, by_label) or f"it has {some(list(by_label), 4)}")
 
 
 def refuse_unknown(option: str, given: Iterable[str], known: Collection[str], what: str) -> None:

@@ -73,8 +73,7 @@ def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
     """One row for each task, with the seconds of its computation in any run, and one for each flow that failed."""
     rows = []
     for h in graph.nodes:
-        before = None if h.ref is None else h.ref.seconds
-        seconds = h.took.seconds if h.status == "computed" else before
+        seconds = None if h.ref is None else h.ref.seconds
         reason = one_line(h.error) if h.error is not None else h.reason
         rows.append(TaskRow(h.label, h.stage, h.status, seconds, reason, h.cause))  # type: ignore[arg-type]
     known = {row.label for row in rows}

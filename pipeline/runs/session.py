@@ -7,15 +7,14 @@ whose report names its holes.
 
 from __future__ import annotations
 
-import hashlib
+import re
 import sys
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
@@ -37,14 +36,12 @@ from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
-from rille.pipeline.runs import part_of_run, roots
+from rille.pipeline.report.delivery import lacking, left_out
+from rille.pipeline.runs import part_of_run, roots, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError, within
-
-if TYPE_CHECKING:
-    from rille.pipeline.runs import run_files
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -55,19 +52,14 @@ def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
     ConfigError
         The text is no range, or the range is empty or reaches beyond the sequence.
     """
-    remedy = f"give START:STOP[:STEP] within 0:{count}"
-    try:
-        parts = [int(p) if p else None for p in (":" if text is None else text).split(":")]
-        if not 2 <= len(parts) <= 3 or any(p is not None and p < 0 for p in parts) or parts[2:] == [0]:
-            raise ValueError(text)
-    except (ValueError, AttributeError):  # from Python it may be no text
-        raise ConfigError("RIL-055", f"--frames {text!r} is not a range", remedy=remedy) from None
-    if (parts[1] or 0) > count or (parts[0] or 0) >= count:
-        raise ConfigError("RIL-057", f"--frames {text!r} reaches beyond the sequence's {count} frames", remedy=remedy)
-    chosen = tuple(range(count)[slice(*parts)])
+    # From Python it may be no text.
+    found = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::(\d{0,9}))?", ":" if text is None else str(text))
+    start, stop, step = (int(part) if part else None for part in found.groups()) if found else (0, 0, 1)
+    chosen = range(count)[start:stop:step] if step != 0 and (stop or 0) <= count else ()
     if not chosen:
-        raise ConfigError("RIL-058", f"--frames {text!r} leaves no frame", remedy="widen the range")
-    return chosen
+        shown = f"--frames {text!r} is no range of the sequence's {count} frames"
+        raise ConfigError("RIL-055", shown, remedy=f"give START:STOP[:STEP] within 0:{count}")
+    return tuple(chosen)
 
 
 def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -182,8 +174,6 @@ def perform(
     kept : list that holds the workers after the run, for the next run with the same list; its maker ends them.
     warn : takes warnings, one line each; those of the input come before anything is computed.
     """
-    from rille.pipeline.runs import run_files  # imports matplotlib, which a wrong option should not have to wait for
-
     opened = _open(sequence, options, verb, warn)
     made: run_files.Made = {}
     opened.graph.last = lambda: run_files.lay_out(opened.graph, late(opened.view, opened.drive), made)
@@ -202,8 +192,6 @@ def perform(
 
 def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:
     """Outcome of a run, with its closing lines; ``missing`` as its report lists it."""
-    from rille.pipeline.report.delivery import lacking, left_out
-
     counts, lines, arrived = result.counts, [], True
     if opened.drive is not None:
         outcome, stops = opened.drive.outcome(), opened.drive.driven.stops
@@ -212,7 +200,8 @@ def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, s
     page = opened.folder / "report.html"
     # Answers of stages, and failures outside of the reconstruction, do not count; nor do they in the exit code.
     lost = lacking(missing)
-    lines.append(f"{page}  computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}")
+    made = f"computed {counts['computed']}, cached {counts['cached']}, missing {len(lost)}"
+    lines.append(f"{page}  {made}, in {result.seconds:.1f} s")
     if opened.view.part:
         lines.append(f"left out, as {opened.view.part} asks: {left_out(result.left_out)}")
     complaints = [
@@ -242,7 +231,7 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
     graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
     products, drive = dataflow(graph, sequence, config, frames)
     # After the layout, so that no folder is left if that refuses something.
-    folder = _make_folder(options.runs / sequence.name, started, text + repr(frames))
+    folder = _make_folder(options.runs / sequence.name, started)
     atomic.write(folder / "config.toml", text)
     view = RunView(
         **vars(settled),
@@ -286,9 +275,6 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
 
 def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict[str, Any]:
     """Write all files of the run; return the content of ``report.json``."""
-    from rille.pipeline.report.delivery import lacking
-    from rille.pipeline.runs import run_files
-
     # The folder may be removed during the run; writing would make one without its first files.
     if not (opened.folder / "config.toml").exists():
         text = f"{opened.folder} was removed while the run was under way"
@@ -315,24 +301,19 @@ def _idle(opened: _Opened) -> Iterator[str]:
         yield f"rille: error RIL-735: --force {', '.join(idle)}: this run has no such task: leave it out"
 
 
-def _make_folder(parent: Path, started: datetime, plan: str) -> Path:
-    """Make a folder named by time and a short digest of the plan."""
+def _make_folder(parent: Path, started: datetime) -> Path:
+    """Make a folder named by the time of the start."""
     latest = parent / "latest"
     if latest.exists() and not latest.is_symlink():
         text = f"{latest} is no link to a run"
         raise ConfigError("RIL-765", text, remedy="move it away, or choose another --runs folder")
-    name = f"{started:%Y%m%dT%H%M%SZ}-{hashlib.sha256(plan.encode()).hexdigest()[:8]}"
-    # Two runs of one plan within a second: mkdir decides which of them has the name.
-    for suffix in chain([""], (f"-{number}" for number in count(2))):
-        folder = parent / (name + suffix)
-        try:
-            folder.mkdir(parents=True)
-            break
-        except OSError as error:
-            if folder.is_dir():
-                continue
-            text = f"cannot make {folder}: {reason_of(error)}"
-            raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
+    # With microseconds, so that runs within a second have names of their own, in their order.
+    folder = parent / f"{started:%Y%m%dT%H%M%SZ-%f}"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        text = f"cannot make {folder}: {reason_of(error)}"
+        raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
@@ -13,7 +12,7 @@ from place import MOCKUP, OTHER, SEQUENCE, Place, sets
 
 from rille.pipeline.cli import app
 
-RUN_ID = r"\d{8}T\d{6}Z-[0-9a-f]{8}"
+RUN_ID = r"\d{8}T\d{6}Z-\d{6}"
 RECONSTRUCTED = {"report.html", "report.json", "config.toml", "ledger.jsonl", "trajectory.tum", "trajectory.kitti"}
 RECONSTRUCTED |= {
     "dem.tif",
@@ -44,12 +43,13 @@ def test_reconstruct(place: Place, name: str, frames: int) -> None:
     sequence = {"mockup": "mockup-short"}.get(name, name)
     first, second = place.said[name], place.said[f"{name} again"]
     assert (first.status, second.status) == (0, 0), first.err + second.err
-    counts = r"computed (\d+), cached (\d+), missing (\d+)"
+    counts = r"computed (\d+), cached (\d+), missing (\d+), in [\d.]+ s"
     made = re.fullmatch(rf"(runs/{sequence}/{RUN_ID})/report.html  {counts}", first.last)
     assert made, first.last
     folder, total = place.folder / made[1], int(made[2]) + int(made[3])
     again = place.runs(sequence)[-1]
-    assert second.last == f"runs/{sequence}/{again.name}/report.html  computed 0, cached {total}, missing {made[4]}"
+    counted = f"runs/{sequence}/{again.name}/report.html  computed 0, cached {total}, missing {made[4]}, in "
+    assert second.last.startswith(counted)
     assert (folder.parent / "latest").resolve() == again
     assert {p.name for p in folder.iterdir()} >= RECONSTRUCTED
     poses = [line for line in (folder / "trajectory.tum").read_text().splitlines() if not line.startswith("#")]
@@ -74,41 +74,10 @@ def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(plac
     assert [item["kind"] for item in report["absent"]] == ["part"]
 
 
-def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None:
-    crate, runs = tmp_path / "crate", tmp_path / "runs"
-    exported = place.rille("export", "other", "--to", "rocrate", "--output", crate)
-    assert (exported.status, exported.err) == (0, "")
-    metadata = json.loads((crate / "ro-crate-metadata.json").read_text())
-    entities = {one["@id"]: one for one in metadata["@graph"]}
-    assert entities["ro-crate-metadata.json"]["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
-    parts = {part["@id"] for part in entities["./"]["hasPart"]}
-    assert {"dem.tif", "config.toml", "terrain.zarr/.zattrs", "trajectory.tum"} <= parts
-    assert all(hashlib.sha256((crate / name).read_bytes()).hexdigest() == entities[name]["sha256"] for name in parts)
-    image = hashlib.sha256(next((place.folder / "other" / "left").iterdir()).read_bytes()).hexdigest()
-    assert image in {entities[one["@id"]].get("value") for one in entities["#run"]["object"]}
-    again = place.rille("reconstruct", crate, "--jobs", "1", "--runs", runs)
-    assert again.status == 0, again.err
-    assert re.fullmatch(rf"(\d+) of \1 results are those of {crate}, to the bit", again.last)
-    other = place.rille(
-        "reconstruct", crate, "--jobs", "1", "--runs", runs, "--set", "merge.alike=0.5", "--only", "dem.tif"
-    )
-    assert other.status == 3
-    assert "RIL-041" in other.err
-
-
-@pytest.mark.parametrize(
-    "content", ["{", '{"@graph": []}', '{"@graph": [{"@id": "#run", "name": "rm -r x", "result": []}]}']
-)
-def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, content: str) -> None:
-    (tmp_path / "ro-crate-metadata.json").write_text(content)
-    refused = place.here("reconstruct", str(tmp_path))
-    assert (refused.status, "RIL-023" in refused.complaint) == (2, True)
-
-
 def test_reconstruct_says_how_it_goes(place: Place) -> None:
     plain = place.said["mockup"].err.splitlines()
     told = [line for line in plain if not line.startswith("rille: note: ")]
-    assert re.fullmatch(r"rille: \d+ computed, 0 cached in [\d.]+ s", told[-1])
+    assert all(re.fullmatch(r"rille: (\d+/\d+ tasks, .*|\S+: compiling, once: \d+ s)", line) for line in told)
     assert all(line.startswith("rille: ") for line in plain)
 
 
@@ -123,8 +92,12 @@ def test_drive(place: Place) -> None:
     assert (first.status, second.status) == (0, 0), first.err + second.err
     assert re.fullmatch(r"goal: \d+ mm from the goal  \(\d+ stops?\)", first.lines[-2])
     assert first.lines[-2] == second.lines[-2]
-    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}/report.html  computed \d+, cached 0, missing 0", first.last)
-    assert re.fullmatch(rf"runs/mockup-loop/{RUN_ID}/report.html  computed 0, cached \d+, missing 0", second.last)
+    assert re.fullmatch(
+        rf"runs/mockup-loop/{RUN_ID}/report.html  computed \d+, cached 0, missing 0, in [\d.]+ s", first.last
+    )
+    assert re.fullmatch(
+        rf"runs/mockup-loop/{RUN_ID}/report.html  computed 0, cached \d+, missing 0, in [\d.]+ s", second.last
+    )
     folder, again = place.runs("mockup-loop")
     assert {p.name for p in folder.iterdir()} == {p.name for p in again.iterdir()}
     assert {p.name for p in folder.iterdir()} >= {"report.html", "report.json", "config.toml", "ledger.jsonl"}

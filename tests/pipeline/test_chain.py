@@ -182,7 +182,7 @@ def test_a_figure_that_cannot_be_drawn_is_missing(
     found = json.loads((latest(cold) / "report.json").read_text())
     assert not found["complete"]
     lost = lacking(found["missing"])
-    assert told.out.endswith(f"missing {len(lost)}\n")
+    assert f", missing {len(lost)}, in " in told.out
     assert [line for line in told.err.splitlines() if line.startswith("rille: missing: ")] == [
         f"rille: missing: {m['what']}: {m['why']}" for m in lost
     ]
@@ -251,7 +251,6 @@ def test_frames_are_chosen_strictly() -> None:
     assert session.choose_frames("2:8:3", 9) == (2, 5)
     assert session.choose_frames(None, 3) == (0, 1, 2)
     assert session.choose_frames("4:5", 9) == (4,)
-    refused = {"3": "055", "a:b": "055", "0:10": "057", "5:5": "058", "-3:5": "055", "0:9:0": "055"}
-    for bad, number in refused.items():
-        with raises(f"RIL-{number}"):
+    for bad in ("3", "a:b", "0:10", "9:", "5:5", "-3:5", ":-1", "0:9:0", "0:9:1:1", ""):
+        with raises("RIL-055", "9 frames"):
             session.choose_frames(bad, 9)

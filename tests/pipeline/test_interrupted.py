@@ -10,7 +10,7 @@ from rille.pipeline.runs import session
 
 
 def test_ctrl_c_says_what_the_documents_say(monkeypatch, capsys):
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(session, "perform", interrupted)

@@ -70,7 +70,7 @@ def driving() -> Drive:
     """The closed loop as the program drives it by default, at its start."""
     sequence = open_sequence("mockup-loop")
     flow = Drive(Graph(), sequence, config.build(config.expand(sequence.defaults)))
-    flow.build()
+    flow.graph.flow(flow.steps())
     return flow
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rille.pipeline.engine.runtime import kernels
-from rille.pipeline.runs.options import COMPLETE, Options
+from rille.pipeline.runs.options import Options
 from rille.pipeline.runs.session import perform
 
 SMALL = (
@@ -28,7 +28,7 @@ SMALL = (
 """A reconstruction of five small pairs, which calls all kernels of `mockup-short` except one."""
 
 
-def compile_kernels() -> int:
+def compile_kernels() -> None:
     """Compile the numerical kernels for this user and machine, so that the first run need not.
 
     Runs two small simulated sequences in a temporary folder. What is compiled stays: again, nothing is left to compile.
@@ -43,7 +43,6 @@ def compile_kernels() -> int:
         perform("mockup-loop", driven, verb="drive", warn=lambda _: None)
     made, seconds = len(_kernels() - before), time.perf_counter() - began
     print(f"{kernels.folder()}  kernels compiled: {made}, in {seconds:.0f} s")
-    return COMPLETE
 
 
 def _kernels() -> set[str]:

@@ -26,7 +26,8 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs.options import COMPLETE, FLAG, Settings, Work, cache_folder
+from rille.pipeline.runs import run_files
+from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 
 
@@ -35,7 +36,7 @@ def plan(
     *,
     options: Work = Work(),
     verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
-) -> int:
+) -> None:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
 
     Parameters
@@ -50,11 +51,8 @@ def plan(
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
-        from rille.pipeline.runs import run_files  # it imports matplotlib
-
-        if graph.unfinished:  # some inputs are unknown, so they belong to the unknown tasks
-            return
-        run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
+        if not graph.unfinished:  # else some inputs are unknown, so they belong to the unknown tasks
+            run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))
@@ -68,7 +66,6 @@ def plan(
     # The refusal comes last, after the table with its task.
     for line in chain(describe(graph, result, workers, verbose=verbose), needs(planned, budget)):
         print(line)
-    return COMPLETE
 
 
 def needs(planned: list[tuple[Handle, float]], budget: memory.Budget) -> Iterable[str]:
@@ -133,7 +130,7 @@ def _unknown(result: Result) -> Iterable[str]:
         yield f"more tasks follow, known only after {some(list(dict.fromkeys(result.unknown)), 3)}"
 
 
-def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
+def graph(seq: str = "mockup", *, options: Settings = Settings()) -> None:
     """Draw the stages of a run, the number of their tasks, and what each reads.
 
     What depends on results that are still to come is drawn as the last run had it; where there was none, the title says
@@ -151,7 +148,6 @@ def graph(seq: str = "mockup", *, options: Settings = Settings()) -> int:
     result = run(laid_out, Store(cache_folder(options.cache)), RunOptions(dry=True))
     result.check()
     print(dot(laid_out, result))
-    return COMPLETE
 
 
 def dot(graph: Graph, result: Result) -> str:

@@ -2,60 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from rille.datasets.text.warning import warning
 from rille.pipeline.commands import batch
-from rille.pipeline.engine.plain import some, warn
-from rille.pipeline.export.programs import rocrate
+from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.runs import session
-from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
+from rille.pipeline.runs.options import DriveOptions, Options
 
 
 def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:
     """Reconstruct sequences; the same command again resumes, and recomputes only what changed.
 
-    Of several a table says at the end what became of each; the exit code is that of the worst. One that cannot be
-    reconstructed ends the command, unless with --keep-going.
+    Of several a table lists the runs at the end, as `rille runs` does; the exit code is that of the worst. One that
+    cannot be reconstructed ends the command, unless with --keep-going.
 
     Parameters
     ----------
     seq
-        A name from `rille datasets list`, a folder whose layout is recognised, a manifest, or an RO-Crate of a run
-        (`rille export`), which is run again from its sequence and compared.
+        A name from `rille datasets list`, a folder whose layout is recognised, or a manifest.
     more
         Others, which follow one after another.
     """
     if not more:
         return _perform(seq, options)[0]
-    sequences = (seq, *more)
-    ended = batch.each(sequences, lambda name: _perform(name, options), keep_going=options.keep_going)
-    print(batch.table(ended, sequences))
-    return batch.worst(ended)
+    code, ended = batch.each((seq, *more), lambda name: _perform(name, options), keep_going=options.keep_going)
+    runs = describe(end for _, end in ended if isinstance(end, Path))
+    print("\n".join([*runs, *(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str))]))
+    return code
 
 
-def _perform(seq: str, options: Options) -> tuple[int, Path]:
-    """Run a sequence, or the run of a crate again; return the exit code and the folder of the results."""
-    crate = rocrate.read(Path(seq))
-    if crate is not None:
-        frames = crate.options.get("--frames", (None,))[-1]
-        options = replace(
-            options,
-            config=options.config or crate.folder / "config.toml",
-            frames=options.frames or frames,
-            until=options.until or crate.options.get("--until", ()),
-            only=options.only or crate.options.get("--only", ()),
-        )
-    result = session.perform(seq if crate is None else crate.sequence, options)
+def _perform(seq: str, options: Options, verb: str = "reconstruct") -> tuple[int, Path]:
+    """Run a sequence; return the exit code and the folder of the results."""
+    result = session.perform(seq, options, verb=verb)
     result.print()
-    if crate is None:
-        return result.code, result.folder
-    unlike = crate.unlike(result.folder)
-    print(f"{len(crate.digests) - len(unlike)} of {len(crate.digests)} results are those of {crate.folder}, to the bit")
-    if unlike:
-        warn(warning("RIL-041", f"other results than those of the crate: {some(unlike, 6)}"))
-    return max(result.code, HOLES if unlike else COMPLETE), result.folder
+    return result.code, result.folder
 
 
 def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -> int:
@@ -69,6 +49,4 @@ def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -
     seq
         A simulated sequence; mockup-loop.
     """
-    result = session.perform(seq, options, verb="drive")
-    result.print()
-    return result.code
+    return _perform(seq, options, "drive")[0]

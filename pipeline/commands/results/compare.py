@@ -15,11 +15,11 @@ from rille.datasets.text.reading import read_toml
 from rille.pipeline import api
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, Run, Runs
+from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.quantities import metres, quantity
 
 
-def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
+def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> None:
     """Compare two runs: which parameters, tasks, figures and positions differ.
 
     Their elevations: rille compare-dem A B.
@@ -31,7 +31,6 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> int:
         settings = [dict(dotted(read_toml(run / "config.toml", "configuration"))) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
     print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines]))
-    return COMPLETE
 
 
 def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
@@ -61,17 +60,17 @@ def _fate(a: str | None, b: str | None) -> str:
 
 
 def _figures(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
-    """Figures of the report, without times, that differ or that one run alone has."""
-    one, other = ({k: m for k, m in report["metrics"].items() if k != "wall_clock"} for report in (a, b))
-    both = [name for name in one if name in other]
-    words = {n: tuple(quantity(m[n]["value"], m[n]["unit"]) for m in (one, other)) for n in both}
+    """Figures of the report, without times, that differ."""
+    one, other = a["metrics"], b["metrics"]
     # Compared in words, of three digits, to avoid "12.3 -> 12.3".
+    words = {name: [_in_words(m.get(name)) for m in (one, other)] for name in one | other if name != "wall_clock"}
     differ = [name for name, (before, after) in words.items() if before != after]
-    yield f"figures       {len(both) - len(differ)} equal to three digits, {len(differ)} differ"
-    yield from (f"  {one[name]['label']}: {' -> '.join(words[name])}" for name in differ)
-    for where, metrics, without in (("in A alone", one, other), ("in B alone", other, one)):
-        alone = [metric for name, metric in metrics.items() if name not in without]
-        yield from (f"  {m['label']}: {quantity(m['value'], m['unit'])} {where}" for m in alone)
+    yield f"figures       {len(words) - len(differ)} equal to three digits, {len(differ)} differ"
+    yield from (f"  {(one | other)[name]['label']}: {' -> '.join(words[name])}" for name in differ)
+
+
+def _in_words(metric: Mapping[str, Any] | None) -> str:
+    return "none" if metric is None else quantity(metric["value"], metric["unit"])
 
 
 def _positions(a: Path, b: Path) -> str:

@@ -20,7 +20,7 @@ from rille.pipeline.export import read_dem
 from rille.pipeline.export.read_dem import DemFile, crs_name
 from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, FLAG, RUNS, Output, Runs, check_output, output_file
+from rille.pipeline.runs.options import FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import metres
@@ -41,7 +41,7 @@ def compare_dem(
     changes: Annotated[bool, FLAG] = False,
     output: Annotated[Path, Output] = Path("dem_comparison"),
     runs: Runs = RUNS,
-) -> int:
+) -> None:
     """Compare elevation model A with reference B: errors, completeness, error against range and slope.
 
     The finer one is brought to the coarser one's cells (means of the known cells inside, or bilinear between four known
@@ -89,15 +89,13 @@ def compare_dem(
     profile = {"driver": "COG", "crs": crs or None, "transform": read_dem.transform_of(cells)}
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)
     print(f"{raster}  {facts}")
-    return COMPLETE
 
 
 def _placed(paths: Sequence[Path], one: DemFile, other: DemFile) -> tuple[Floats, dict[str, Any]]:
     """Motion (2, 3) of x, y that aligns the terrain of a run with that of another, and its facts for the JSON file."""
     files = [path for path in paths if not path.is_dir()]
     if files:
-        text = f"{files[0]} is no run: it has no ortho image"
-        raise InputError("RIL-908", text, remedy="leave --align place out")
+        raise InputError("RIL-908", f"{files[0]} is no run: it has no ortho image", remedy="leave --align place out")
     image, reference = (read_dem.read_ortho(path / "ortho.tif")[0] for path in paths)
     placed = register((image, reference), (one.grid, other.grid))
     x, y, heading = from_above(placed.pose)

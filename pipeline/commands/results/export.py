@@ -8,26 +8,24 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from rille.pipeline.commands.complaints import complain
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import FILES, export_run
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
-from rille.stages.core.errors import ConfigError, RilleError
+from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 
-Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
+Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2"]
 
 
 def export(
     run: Run,
     *,
-    to: Annotated[list[Form], Parameter(negative="")],
+    to: Form,
     output: Annotated[Path | None, Output] = None,
     every: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
     voxel: Annotated[float, Parameter(validator=Number(gte=0))] = 0.0,
     runs: Runs = RUNS,
     cache: CacheFolder = None,
-) -> int:
+) -> None:
     """Write a run for other programs: cloud.laz or cloud.ply (points), terrain.glb (mesh), a model, a map.
 
     Parameters
@@ -36,30 +34,18 @@ def export(
         laz (CloudCompare, PDAL, QGIS), ply (CloudCompare, MeshLab): every matched pixel as a point with its standard
         deviations; glb: the ground as a mesh, for any glTF viewer, Blender; frames: position, range, normal, slope,
         roughness and disparity of each pair as rasters of its left image; colmap: cameras, rig, poses and tracked
-        points; nav2: occupancy map of ROS 2's navigation; rocrate: an RO-Crate of all files with digests of results and
-        inputs, parameters, versions and the command, for archives; `rille reconstruct` runs it again. May be repeated.
+        points; nav2: occupancy map of ROS 2's navigation.
     output
-        What to write, for one form only; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in
-        the run's folder.
+        What to write; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in the run's folder.
     every
         laz, ply: each so many-th row and column of the images alone.
     voxel
         laz, ply: one point in each cube of so many metres; 0: all.
     """
-    if output is not None and len(to) > 1:
-        text = f"--output names one place for {len(to)} forms"
-        raise ConfigError("RIL-020", text, remedy="give one --to, or leave --output out")
-    folder, store, code = lookup.find(run, runs), Store(cache_folder(cache)), COMPLETE
-    for form in to:
-        if output is not None and form in FILES:
-            check_output(output, f".{form}")
-        path = output or folder / FILES.get(form, form)
-        thinning = {"every": every, "voxel": voxel} if form in ("laz", "ply") else {}
-        try:
-            with lookup.reading(folder):
-                print(f"{path}  {export_run(form, folder, path, store, **thinning)}")
-        except RilleError as error:  # other forms may not need what this one lacks
-            if form == to[-1]:
-                raise
-            code = complain(error)
-    return code
+    if output is not None and to in FILES:
+        check_output(output, f".{to}")
+    folder = lookup.find(run, runs)
+    path, thinning = output or folder / FILES.get(to, to), {"every": every, "voxel": voxel}
+    with lookup.reading(folder):
+        words = export_run(to, folder, path, Store(cache_folder(cache)), **(thinning if to in ("laz", "ply") else {}))
+    print(f"{path}  {words}")

@@ -20,7 +20,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
 from rille.pipeline.export.writers import Meaning, check_folder, write_raster
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, Output, Run, Runs
+from rille.pipeline.runs.options import RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
 from rille.stages.core.quantities import metres
@@ -59,7 +59,7 @@ class Session:
         return float(np.nanmedian(self.terrain.elevation))
 
 
-def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RUNS) -> int:
+def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RUNS) -> None:
     """Merge the terrains of several runs of one place: dem.tif, dem_sigma.tif and ortho.tif in the first run's frame.
 
     Runs with georeferences in one system are laid by these, others by ortho images or relief; then elevations decide,
@@ -100,7 +100,6 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
         f"{output}: dem.tif, dem_sigma.tif, ortho.tif, merge.json: {int(known.sum())} cells of {lattice.cell:g} m, "
         f"{int((merged.count > 1).sum())} of several runs"
     )
-    return COMPLETE
 
 
 def _registered(first: Terrain, other: Terrain) -> Session:

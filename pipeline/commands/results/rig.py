@@ -58,7 +58,7 @@ def rig(
     output: Annotated[Path, Output] = Path("rig.toml"),
     runs: Runs = RUNS,
     cache: CacheFolder = None,
-) -> int:
+) -> None:
     """Estimate one rig from several runs with one calibration; manifests pin it by `rig.file`.
 
     Prints the correction of each parameter by each run, and by all. `rille reconstruct SEQ --until rig` computes what
@@ -93,7 +93,6 @@ def rig(
         warn(line)
     print(f"wrote        {output}\nnext         in the manifest of each sequence:")
     print(f'\n[rig]\nfile = "{output.resolve()}"')
-    return options.COMPLETE
 
 
 def _matches(artifacts: RunArtifacts) -> Iterator[PointPairs]:

@@ -11,11 +11,11 @@ from pathlib import Path
 from rille.datasets.text.count import count
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, Run, Runs
+from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.errors import ConfigError
 
 
-def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> int:
+def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> None:
     """List runs, the latest last: name, state, tasks computed and cached, seconds.
 
     Parameters
@@ -28,7 +28,6 @@ def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> int:
         text = f"{runs} holds no run{f' of {sequence}' if sequence else ''}"
         raise ConfigError("RIL-880", text, remedy="check --runs")
     print("\n".join(describe(chosen)))
-    return COMPLETE
 
 
 def describe(chosen: Iterable[Path]) -> Iterator[str]:
@@ -50,7 +49,7 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             yield f"{lookup.name(run):44s} {state:12s} {counts} {took:>8s}"
 
 
-def timing(run: Run = "latest", *, runs: Runs = RUNS) -> int:
+def timing(run: Run = "latest", *, runs: Runs = RUNS) -> None:
     """Show where the time of a run went, by stage.
 
     Seconds of all tasks of a stage together; compiling: the part that compiled kernels, or waited for another worker
@@ -59,7 +58,6 @@ def timing(run: Run = "latest", *, runs: Runs = RUNS) -> int:
     folder = lookup.find(run, runs)
     with lookup.reading(folder):
         print("\n".join(by_stage(folder)))
-    return COMPLETE
 
 
 def by_stage(run: Path) -> Iterator[str]:
@@ -78,7 +76,7 @@ def by_stage(run: Path) -> Iterator[str]:
         yield f"{name:19s} {sums['seconds']:9.1f} {sums['compiling']:9.1f} {sums['computed']:8d} {sums['cached']:8d}"
 
 
-def view(run: Run = "latest", *, runs: Runs = RUNS) -> int:
+def view(run: Run = "latest", *, runs: Runs = RUNS) -> None:
     """Open the report of a run in the browser; print its path."""
     from rille.pipeline import api  # imports NumPy, which a list does not need
 
@@ -88,4 +86,3 @@ def view(run: Run = "latest", *, runs: Runs = RUNS) -> int:
     if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         opened.show()
     print(page)
-    return COMPLETE

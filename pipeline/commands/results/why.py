@@ -15,7 +15,8 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
-from rille.pipeline.runs.options import COMPLETE, RUNS, CacheFolder, Run, Runs, cache_folder
+from rille.pipeline.runs.options import RUNS, CacheFolder, Run, Runs, cache_folder
+from rille.stages.core.errors import ConfigError, did_you_mean
 
 SHORT_DIGITS = 12
 """Shown hexadecimal digits of a digest."""
@@ -27,7 +28,7 @@ WIDTH = 70
 """Most characters of a value."""
 
 
-def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFolder = None) -> int:
+def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFolder = None) -> None:
     """Explain one task of a run: its inputs, why it was computed, its parameters and code, what changed since.
 
     Parameters
@@ -40,7 +41,6 @@ def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFol
     with lookup.reading(folder):
         lines = summary(folder) if task is None else describe(folder, task, Store(cache_folder(cache)))
         print("\n".join(lines))
-    return COMPLETE
 
 
 def summary(run: Path) -> Iterable[str]:
@@ -64,12 +64,15 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     ConfigError
         The run has no such task.
     """
-    rows = events.read(run / lookup.LEDGER)
-    row = lookup.row(rows, label, run)
+    rows = {row["label"]: row for row in events.read(run / lookup.LEDGER)}
+    if label not in rows:
+        text = f"run {lookup.name(run)} has no task {label!r}"
+        raise ConfigError("RIL-068", text, remedy=did_you_mean(label, rows) or f"it has {some(list(rows), 4)}")
+    row = rows[label]
     made = store.manifest(row["stage"], row["key"]) if "key" in row else None
     yield f"{label}: stage {row['stage']}, {row['status']} in run {lookup.name(run)}"
     yield from _fate(row, run, made, store)
-    yield from _inputs(row, {r["label"]: r for r in rows})
+    yield from _inputs(row, rows)
     if made is None:
         if "key" in row and row["status"] in ("computed", "cached"):
             gone = f"{row['key'][:SHORT_DIGITS]} has gone from {store.root}, or the run used another cache (--cache)"
@@ -148,24 +151,18 @@ def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, A
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
     """Differences from the last earlier run that had this task."""
-    for before in lookup.earlier(run):
-        rows = events.read(before / lookup.LEDGER)
-        other = next((r for r in rows if r["label"] == row["label"] and "key" in r), None)
-        if other is not None:
-            differences = _differences(other, row, made, store)
-            yield from (f"since         {lookup.name(before)}: {difference}" for difference in differences)
-            return
-    yield "since         no earlier run of this sequence had this task"
-
-
-def _differences(
-    other: Mapping[str, Any], row: Mapping[str, Any], made: Mapping[str, Any], store: Store
-) -> Iterable[str]:
+    past = ((before, other) for before in lookup.earlier(run) for other in events.read(before / lookup.LEDGER))
+    had = ((before, other) for before, other in past if other["label"] == row["label"] and "key" in other)
+    before, other = next(had, (run, None))
+    if other is None:
+        yield "since         no earlier run of this sequence had this task"
+        return
     if other["key"] == row["key"]:
-        yield "nothing changed, the key is the same"
+        found = ["nothing changed, the key is the same"]
     elif (then := store.manifest(row["stage"], other["key"])) is None:
-        yield "another key; its artifact has gone, so what differs is not known"
+        found = ["another key; its artifact has gone, so what differs is not known"]
     else:
-        yield from provenance.differences(then["provenance"], made["provenance"]) or ["the key has another format"]
+        found = provenance.differences(then["provenance"], made["provenance"]) or ["the key has another format"]
         if other.get("digest") == row.get("digest"):
-            yield "another key, and yet the result is the same to the bit"
+            found.append("another key, and yet the result is the same to the bit")
+    yield from (f"since         {lookup.name(before)}: {difference}" for difference in found)

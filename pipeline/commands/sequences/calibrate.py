@@ -23,7 +23,7 @@ from rille.datasets.text.reading import read_text
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_new, check_output
+from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig, check_sides
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
@@ -67,7 +67,7 @@ def calibrate(
     model: Literal["radtan", "radtan4", "rational", "fisheye"] = "radtan",
     output: Annotated[Path, Output] = Path("rig.yaml"),
     keep_bad: Annotated[bool, FLAG] = False,
-) -> int:
+) -> None:
     """Calibrate a stereo rig from pictures of a chessboard; prints the residual of each view.
 
     Parameters
@@ -110,7 +110,6 @@ def calibrate(
     for line in doubts(rig, boards, model):
         warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
-    return COMPLETE
 
 
 def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:

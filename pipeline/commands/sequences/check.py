@@ -49,7 +49,7 @@ def check(seq: str, *more: str, options: Settings = Settings()) -> int:
     """
     if not more:
         return _check(seq, options)
-    return batch.worst(batch.each((seq, *more), lambda name: (_check(name, options), None), keep_going=True))
+    return batch.each((seq, *more), lambda name: (_check(name, options), ""), keep_going=True)[0]
 
 
 def _check(seq: str, options: Settings) -> int:

@@ -14,22 +14,21 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.flow import config
-from rille.pipeline.runs.options import COMPLETE, Assignments, CacheFolder, cache_folder
+from rille.pipeline.runs.options import Assignments, CacheFolder, cache_folder
 
 app = App(name="datasets", help=__doc__)
 
 
 @app.default
 @app.command(name="list")
-def list_datasets() -> int:
+def list_datasets() -> None:
     """List the built-in sequences and the folder layouts that are recognised."""
     for name, words in registry.catalogue():
         print(f"{name:16s} {words}")
-    return COMPLETE
 
 
 @app.command(name="export")
-def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), cache: CacheFolder = None) -> int:
+def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), cache: CacheFolder = None) -> None:
     """Write a built-in sequence as plain files (PNG, rig, poses, disparity, DEM, times), for use by other tools.
 
     Parameters
@@ -52,4 +51,3 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
 
     sequence = registry.open_sequence(seq, for_dataset)
     print(export(sequence, directory, lambda source: store.open(artifact(source))))
-    return COMPLETE

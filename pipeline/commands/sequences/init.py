@@ -14,7 +14,7 @@ from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_
 from rille.datasets.registry import hindrance
 from rille.datasets.text.names import derived_name
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, FLAG, Output, check_new, check_output
+from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.core.errors import ConfigError
 
 
@@ -23,7 +23,7 @@ def init(
     *,
     output: Annotated[Path | None, Output] = None,
     force: Annotated[bool, FLAG] = False,
-) -> int:
+) -> None:
     """Write a commented manifest of a folder of stereo images: what was found, and what is still needed.
 
     Parameters
@@ -40,7 +40,7 @@ def init(
         manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
         print(f"{directory} opens as it is{manifest}")
         print("\n".join(_next(directory)))
-        return COMPLETE
+        return
     if is_bag(directory):
         text = f"no manifest is written for the bag {directory}: it opens as it is"
         raise hindered or ConfigError("RIL-938", text, remedy="rille check opens it")
@@ -59,7 +59,6 @@ def init(
     elif hindered is not None:
         print(f"{directory} does not open as it is: {hindered.message}")
     print("\n".join(_report(findings, path, needed)))
-    return COMPLETE
 
 
 def _root(directory: Path, path: Path) -> str:

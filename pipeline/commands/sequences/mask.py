@@ -11,14 +11,14 @@ import numpy as np
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.count import count
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.runs.options import COMPLETE, Output, check_new
+from rille.pipeline.runs.options import Output, check_new
 from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
 
-def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
+def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> None:
     """Write masks of what keeps its place in the images, such as the vehicle's own body, for `[masks]` of a manifest.
 
     Twenty images of each camera, spread over the sequence, are compared; where the vehicle stood, all keeps its place.
@@ -56,4 +56,3 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> int:
     if written:
         print("next         look at the .look.png; then in the manifest:\n\n[masks]")
         print("\n".join(written))
-    return COMPLETE

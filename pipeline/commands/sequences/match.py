@@ -5,12 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.pipeline.engine.plain import raw, warn
@@ -18,40 +16,7 @@ from rille.pipeline.export.writers import write_confidence, write_disparity
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
-from rille.stages.core.errors import ConfigError
 from rille.stages.core.validity import matched
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Matcher:
-    """How two images are matched.
-
-    Parameters
-    ----------
-    preset
-        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
-        follows the publication to the letter.
-    """
-
-    preset: Literal["default", "fast", "accurate", "paper"] | None = None
-    assignments: Assignments = ()
-
-    def params(self) -> Any:
-        """Parameters of the matcher.
-
-        Raises
-        ------
-        ConfigError
-            They are of another section, or contradict the preset.
-        """
-        nested = configuration.parse_assignments(self.assignments)
-        configuration.refuse_other_sections(nested, ("hfvm",), "match")
-        values: dict[str, Any] = dict(nested.get("hfvm", {}))
-        if self.preset is not None and values.setdefault("preset", self.preset) != self.preset:
-            text = f"--preset {self.preset} and --set hfvm.preset={values['preset']} contradict each other"
-            raise ConfigError("RIL-986", text, remedy="leave one of them out")
-        return configuration.validate(configuration.stages()["hfvm"].params, values, "hfvm")
 
 
 def match(
@@ -59,7 +24,8 @@ def match(
     right: Path,
     *,
     output: Annotated[Path, Output] = Path("disparity.tif"),
-    matcher: Matcher = Matcher(),
+    preset: Literal["default", "fast", "accurate", "paper"] | None = None,
+    assignments: Assignments = (),
     dense: Annotated[bool, FLAG] = False,
     confidence: Path | None = None,
 ) -> int:
@@ -76,13 +42,20 @@ def match(
         Search image.
     output
         TIFF to write.
+    preset
+        Parameter set of the matcher: fast matches at half the resolution, accurate takes several times as long, paper
+        follows the publication to the letter.
     dense
         Fill undefined disparities by interpolation.
     confidence
         TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
         backmatch_error (pixels).
     """
-    params = matcher.params()
+    nested = configuration.parse_assignments(assignments)
+    configuration.refuse_other_sections(nested, ("hfvm",), "match")
+    # --set overrides --preset, as it does --config.
+    given = ({} if preset is None else {"preset": preset}) | nested.get("hfvm", {})
+    params: Any = configuration.validate(configuration.stages()["hfvm"].params, given, "hfvm")
     taken = {left.resolve(): "an image", right.resolve(): "an image"}
     check_output(output, ".tif", ".tiff", others=taken)
     if confidence is not None:

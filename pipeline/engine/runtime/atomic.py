@@ -85,24 +85,6 @@ def create(path: Path, content: bytes | memoryview) -> bool:
     return True
 
 
-def remove(path: Path, modified: float) -> None:
-    """Remove a file unless its time of change is another than ``modified`` (seconds since 1970).
-
-    It is moved aside before the times are compared. Whoever found it before and touched it gets it back, and whoever
-    comes later does not find it: between looking and removing nobody can come.
-    """
-    aside = _beside(path)
-    os.rename(path, aside)
-    try:
-        if os.stat(aside).st_mtime != modified:
-            # link again: a file that was made anew meanwhile stays.
-            os.link(aside, path)
-    except FileExistsError:
-        pass  # made anew meanwhile
-    finally:
-        aside.unlink()
-
-
 @contextmanager
 def named(path: Path) -> Iterator[None]:
     """Name the file in errors of a block: that of a write to a full disk has no name, others that of a leftover."""

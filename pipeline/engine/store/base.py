@@ -114,7 +114,10 @@ class Store:
                 # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares
                 # what was touched
                 if use and status.st_mtime < time.time() - 3600.0:
-                    folder.touch(path)
+                    with suppress(
+                        OSError
+                    ):  # by such rights nobody clears it up; if it has just gone, its reader says so
+                        os.utime(path)
                 return known or manifest.reference(self.read_manifest(stage, key), status.st_size)
         except FileNotFoundError:
             return None
@@ -207,8 +210,7 @@ class Store:
     def set_aside(self, stage: str, key: str, reason: str) -> bool:
         """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only."""
         try:
-            path = self.root / artifact_path(stage, key)
-            aside = folder.quarantine(path, self.root, f"{stage}-{key[:16]}")
+            aside = folder.quarantine(self.root / artifact_path(stage, key), self.root, f"{stage}-{key[:16]}")
         except OSError as error:
             return isinstance(error, FileNotFoundError)  # another run has set it aside
         with suppress(OSError):

@@ -49,16 +49,6 @@ def clear_errors(root: Path) -> Iterator[None]:
         raise StoreError("RIL-575", text, remedy=remedy_of(error.errno)) from error
 
 
-def touch(path: str) -> None:
-    """Set the times of a file to now, where that is permitted: clearing up spares it."""
-    try:
-        os.utime(path)
-    except FileNotFoundError:
-        raise
-    except OSError:
-        pass  # by these rights nobody clears it up
-
-
 def files(root: Path, area: str) -> list[tuple[str, os.stat_result]]:
     """All files below a folder in ``root``: their paths relative to ``root``, in order, and their status."""
     listed = []

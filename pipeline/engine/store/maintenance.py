@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 
 from rille.pipeline.engine.failures import CLOSED
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store import index
 from rille.pipeline.engine.store.archive import BrokenError
 from rille.pipeline.engine.store.base import GoneError, Store
@@ -88,7 +87,8 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
         cleared[match[1] if match else ""].append(status.st_size)
         try:
             if not dry_run:
-                atomic.remove(store.root / path, status.st_mtime)
+                # A run that has found it just now finds it gone when it reads it, and computes it again.
+                (store.root / path).unlink()
         except OSError as error:
             if error.errno in CLOSED:  # else somebody else cleared it away
                 refused.append(error)

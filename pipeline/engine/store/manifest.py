@@ -105,8 +105,7 @@ def reference(manifest: Manifest, stored: int = 0) -> Ref:
 
 
 def _nbytes(about: Mapping[str, Any]) -> int:
-    size: int = int(about["dtype"][2:]) * math.prod(about["shape"])
-    return size
+    return int(about["dtype"][2:]) * int(math.prod(about["shape"]))
 
 
 def difference(new: Manifest, old: Manifest) -> str:

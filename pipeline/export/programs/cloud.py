@@ -24,9 +24,7 @@ from rille.stages.terrain.points import colours, cubes, one_a_cube
 ABOUT = {
     "sigma_along": "standard deviation along ray, m",
     "sigma_across": "standard deviation across it, m",
-    "ray_x": "direction from camera to point",
-    "ray_y": "direction from camera to point",
-    "ray_z": "direction from camera to point",
+    **dict.fromkeys(("ray_x", "ray_y", "ray_z"), "direction from camera to point"),
     "pair": "frame number of the stereo pair",
 }
 """Descriptions of the columns that LAS does not define, at most 32 characters each."""

@@ -1,4 +1,4 @@
-"""Several sequences in one command: order, exit code, and the table."""
+"""Several sequences in one command: order, exit code, and what became of each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from rille.pipeline.commands import batch
-from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
+from rille.pipeline.commands.computing import reconstruct
+from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE, Options
 from rille.stages.core.errors import DegenerateError, InputError
 
 ENDS = {
@@ -20,12 +21,12 @@ ENDS = {
 }
 
 
-def run(names: list[str], *, keep_going: bool = True) -> list[batch.Ended]:
-    def one(name: str) -> tuple[int, Path | None]:
+def run(names: list[str], *, keep_going: bool = True) -> tuple[int, batch.Ended]:
+    def one(name: str) -> tuple[int, Path | str]:
         end = ENDS[name]
         if isinstance(end, Exception):
             raise end
-        return end, None
+        return end, Path(name)
 
     return batch.each(names, one, keep_going=keep_going)
 
@@ -41,35 +42,40 @@ def run(names: list[str], *, keep_going: bool = True) -> list[batch.Ended]:
     ],
 )
 def test_the_exit_code_is_that_of_the_worst_and_all_are_tried(names, code, capsys):
-    ended = run(names)
-    assert [one.sequence for one in ended] == names
-    assert batch.worst(ended) == code
+    worst, ended = run(names)
+    assert [name for name, _ in ended] == names
+    assert worst == code
     said = capsys.readouterr().err
     assert said.count("rille: error") == sum(isinstance(ENDS[name], Exception) for name in names)
 
 
 def test_what_cannot_be_run_ends_the_others_unless_they_shall_go_on(capsys):
-    names = ["holes", "none", "whole"]
-    ended = run(names, keep_going=False)
-    assert [one.sequence for one in ended] == ["holes", "none"]
+    _, ended = run(["holes", "none", "whole"], keep_going=False)
+    assert ended == [("holes", Path("holes")), ("none", "RIL-276"), ("whole", "not begun")]
     assert "RIL-276" in capsys.readouterr().err
-    rows = [row.split() for row in batch.table(ended, names).splitlines()]
-    assert rows[-2:] == [["none", "refused", "0.0", "RIL-276"], ["whole", "not", "begun"]]
+    assert run(["fault"])[1] == [("fault", "ZeroDivisionError")]
 
 
 def test_an_interrupt_ends_the_command():
-    def one(name: str) -> tuple[int, Path | None]:
+    def one(name: str) -> tuple[int, Path | str]:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         batch.each(["a", "b"], one, keep_going=True)
 
 
-def test_figures_are_those_of_the_report(tmp_path):
-    frames = [{"posed": True}, {"posed": False}, {"posed": True}, {"posed": True}]
-    report = {"metrics": {"trajectory_drift": {"value": 0.71234}}, "frames": frames}
-    report["missing"] = [{"kind": "failed"}, {"kind": "no pose"}, {"kind": "no path"}]
-    report["stages"] = {"a": {"computed": 0, "cached": 2}, "b": {"computed": 1, "cached": 0}}
-    (tmp_path / "report.json").write_text(json.dumps(report))
-    row = batch.table([batch.Ended("street", HOLES, tmp_path, 12.34)], ["street"]).splitlines()[1]
-    assert row.split() == ["street", "with", "holes", "75", "%", "0.712", "%", "2", "1", "2", "12.3", str(tmp_path)]
+def test_runs_are_listed_and_then_the_sequences_without_one(tmp_path, monkeypatch, capsys):
+    def one(name: str, options: Options) -> tuple[int, Path]:
+        if name == "none":
+            raise ENDS["none"]
+        (tmp_path / name / "1").mkdir(parents=True)
+        (tmp_path / name / "1" / "ledger.jsonl").write_text(json.dumps({"run": {"ok": True, "total": 2.5}}) + "\n")
+        return COMPLETE, tmp_path / name / "1"
+
+    monkeypatch.setattr(reconstruct, "_perform", one)
+    assert reconstruct.reconstruct("none", "whole", options=Options(keep_going=True)) == USAGE
+    rows = [row.split() for row in capsys.readouterr().out.splitlines()]
+    assert rows[1:] == [["whole/1", "complete", "0", "0", "2.5"], ["none", "RIL-276"]]
+    monkeypatch.setattr(reconstruct, "_perform", lambda name, options: (COMPLETE, tmp_path / "whole" / "1"))
+    reconstruct.reconstruct("whole", "whole")
+    assert all(capsys.readouterr().out.splitlines())

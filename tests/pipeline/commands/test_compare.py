@@ -35,4 +35,4 @@ def test_figures_of_one_run_are_told() -> None:
     clock = {"wall_clock": {"label": "Time", "value": 3.0, "unit": "s"}}
     lines = list(_figures({"metrics": both | alone | clock}, {"metrics": both}))
     assert "1 equal" in lines[0]
-    assert [line.strip() for line in lines[1:]] == ["Climb: 0.500 m in A alone"]
+    assert [line.strip() for line in lines[1:]] == ["Climb: 0.500 m -> none"]

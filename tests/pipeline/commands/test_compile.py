@@ -41,7 +41,7 @@ def test_only_the_number_of_new_kernels_is_said(
         return RunResult(3, options.runs, ["a run's own words"], [])  # a drive that does not reach its goal
 
     monkeypatch.setattr(compilation, "perform", perform)
-    assert compilation.compile_kernels() == 0
+    compilation.compile_kernels()
     assert re.fullmatch(rf"{kernels}  kernels compiled: 2, in \d+ s\n", capsys.readouterr().out)
     assert len(folders) == 2
     assert not folders[0].exists()

@@ -31,15 +31,23 @@ def folder(tmp_path):
     return tmp_path
 
 
-def run(folder, left="left.png", right="right.png", preset=None, assignments=(), dense=False, **options):
-    matcher = command.Matcher(preset, assignments)
+def run(folder, left="left.png", right="right.png", **options):
     options.setdefault("output", folder / "out.tif")
-    return command.match(folder / left, folder / right, matcher=matcher, dense=dense, **options)
+    return command.match(folder / left, folder / right, **options)
 
 
 def columns(path):
     with rasterio.open(path) as file:
         return file.read(1)
+
+
+def test_a_parameter_that_is_set_overrides_the_preset(folder):
+    made = [{"preset": "fast"}, {"preset": "accurate", "assignments": ("hfvm.preset=fast",)}, {}]
+    files = []
+    for options in made:
+        run(folder, **options)
+        files.append((folder / "out.tif").read_bytes())
+    assert files[0] == files[1] != files[2]
 
 
 def test_writes_two_named_bands_and_says_what_it_found(folder, capsys):

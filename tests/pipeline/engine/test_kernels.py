@@ -173,9 +173,9 @@ def test_a_run_says_what_it_compiled():
     stream = io.StringIO()
     shown = progress.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
-    shown.open(Graph())
-    shown.resolved(handle)
+    shown.open()
+    shown.resolved(handle, 2)
     assert stream.getvalue() == ""
     handle.took = Took(compiling=31.2)
-    shown.resolved(handle)
+    shown.resolved(handle, 2)
     assert "31 s" in stream.getvalue()

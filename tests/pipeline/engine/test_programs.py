@@ -73,7 +73,7 @@ def test_workers_give_the_same_bits_die_alone_and_leave_nobody_behind(cache, tmp
         n: found[n].ref.digest for n in (h.label for h in plain.nodes)
     }
     assert tally.read_text() in ("xx", "xxx", "xxxx"), "two once nothing else ran; dask may count others' deaths, too"
-    assert isinstance(found["die"].error, driver.WorkerDiedError)
+    assert found["die"].error.code == "RIL-586"
     assert found["after"].reason == "die failed"
     assert "UnpicklableError: 1 and 2" in str(found["unpicklable"].error)
     assert "mischief.py" in "".join(found["unpicklable"].error.__notes__), "the traceback on the worker"

@@ -48,7 +48,7 @@ def drive(store: Path, *more: str) -> tuple[Drive, Result]:
     assert sequence.vehicle is not None
     layers: list[dict[str, Any]] = [{"vehicle": sequence.vehicle.model_dump()}, config.expand(sequence.defaults)]
     flow = Drive(Graph(), sequence, config.build(*layers, for_stages))
-    flow.build()
+    flow.graph.flow(flow.steps())
     return flow, driver.run(flow.graph, Store(store), driver.RunOptions(executor="inline", keep_going=True))
 
 
@@ -270,7 +270,7 @@ def test_the_vehicle_that_is_configured_is_the_one_that_stands_on_the_bed(store:
     assert sequence.vehicle is not None
     given: dict[str, Any] = {"vehicle": sequence.vehicle.model_dump()}
     flow = Drive(Graph(), sequence, config.build(given, config.expand(sequence.defaults), for_stages))
-    flow.build()
+    flow.graph.flow(flow.steps())
     flow.graph.waiting.clear()
     driver.run(flow.graph, Store(store), driver.RunOptions(executor="inline")).check()
     assert flow.driven.place is not None

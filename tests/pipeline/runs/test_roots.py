@@ -74,19 +74,19 @@ def test_a_cache_that_may_only_be_read_is_used_without_a_note(used, tmp_path, mo
 
 
 def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):
-    owned, remove = next(used.root.glob("artifacts/*/*/*.zip")), atomic.remove
+    owned, remove = next(used.root.glob("artifacts/*/*/*.zip")), Path.unlink
 
-    def refuse(path: Path, modified: float) -> None:
+    def refuse(path: Path, missing_ok: bool = False) -> None:
         if path == owned:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        remove(path, modified)
+        remove(path, missing_ok=missing_ok)
 
     graph, run = Graph(), tmp_path / "work" / "runs" / "toy" / "2"
     chain.build(graph, seed=1)
     run.mkdir()
     driver.run(graph, used, driver.RunOptions(executor="inline", ledger=run / "ledger.jsonl"))
     shutil.rmtree(run.parent / "1")
-    monkeypatch.setattr(atomic, "remove", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
     with raises("RIL-575", "Permission denied"):
         collect(used, run.parents[1])
     assert owned.exists()

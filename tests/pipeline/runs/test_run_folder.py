@@ -22,7 +22,7 @@ NOW = datetime(2026, 1, 2, tzinfo=UTC)
 def test_what_is_no_link_to_a_run_is_told_before_anything_is_computed(tmp_path, file):
     (tmp_path / "latest").touch() if file else (tmp_path / "latest").mkdir()
     with raises("RIL-765", str(tmp_path / "latest")):
-        session._make_folder(tmp_path, NOW, "plan")
+        session._make_folder(tmp_path, NOW)
     assert [p.name for p in tmp_path.iterdir()] == ["latest"]
 
 
@@ -33,7 +33,7 @@ def test_quiet_is_a_kind_of_progress():
 def test_a_folder_that_is_a_broken_link_is_named(tmp_path):
     (tmp_path / "runs").symlink_to("gone/runs")
     with raises("RIL-061", "--runs"):
-        session._make_folder(tmp_path / "runs" / "toy", NOW, "plan")
+        session._make_folder(tmp_path / "runs" / "toy", NOW)
 
 
 def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, capsys):
@@ -41,7 +41,7 @@ def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, caps
         raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
 
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    folder = session._make_folder(tmp_path, NOW, "plan")
+    folder = session._make_folder(tmp_path, NOW)
     session._point_latest(folder)
     assert "RIL-741" in (said := capsys.readouterr().err)
     assert folder.name in said
@@ -49,14 +49,14 @@ def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, caps
 
 def test_a_link_to_a_run_that_has_gone_is_moved(tmp_path):
     (tmp_path / "latest").symlink_to("gone")
-    folder = session._make_folder(tmp_path, NOW, "plan")
+    folder = session._make_folder(tmp_path, NOW)
     session._point_latest(folder)
     assert (tmp_path / "latest").resolve() == folder
 
 
 def test_a_link_that_a_killed_run_of_this_number_left_is_replaced(tmp_path):
     (tmp_path / f".latest-{os.getpid()}").symlink_to("killed")
-    folder = session._make_folder(tmp_path, NOW, "plan")
+    folder = session._make_folder(tmp_path, NOW)
     session._point_latest(folder)
     assert (tmp_path / "latest").resolve() == folder
 
