@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections import Counter, defaultdict
@@ -16,7 +17,7 @@ from rille.stages.core.errors import ConfigError
 
 
 def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> None:
-    """List runs, the latest last: name, state, tasks computed and cached, seconds.
+    """List runs, the latest last: name, state, tasks computed and cached, seconds, frames with a pose, and drift.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> None:
 
 def describe(chosen: Iterable[Path]) -> Iterator[str]:
     """Lines of the table of runs, the latest last."""
-    yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s}"
+    yield f"{'run':44s} {'state':12s} {'computed':>8s} {'cached':>8s} {'seconds':>8s} {'posed':>9s} {'drift':>8s}"
     for run in sorted(chosen, key=lambda run: run.name):
         with lookup.reading(run):
             facts = events.facts(run / lookup.LEDGER)
@@ -46,7 +47,17 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
             seconds = facts.get("total", facts.get("seconds"))
             took = "" if seconds is None else f"{seconds:.1f}"
-            yield f"{lookup.name(run):44s} {state:12s} {counts} {took:>8s}"
+            posed, drift = _trajectory(run / "report.json")
+            yield f"{lookup.name(run):44s} {state:12s} {counts} {took:>8s} {posed:>9s} {drift:>8s}".rstrip()
+
+
+def _trajectory(report: Path) -> tuple[str, str]:
+    """Frames with a pose, and drift, of a report; empty: there is none, or no truth."""
+    if not report.exists():
+        return "", ""
+    said = json.loads(report.read_text(encoding="utf-8"))
+    frames, drift = said["frames"], said["metrics"].get("trajectory_drift", {}).get("value")
+    return f"{sum(frame['posed'] for frame in frames)}/{len(frames)}", "" if drift is None else f"{drift:.3g} %"
 
 
 def timing(run: Run = "latest", *, runs: Runs = RUNS) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from pathlib import Path
 
@@ -25,6 +26,12 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "unfinished"]
     events.add_facts(run / lookup.LEDGER, total=1.0)
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "complete"]
+    report = {"frames": [{"posed": True}, {"posed": False}], "metrics": {"trajectory_drift": {"value": 0.1234}}}
+    (run / "report.json").write_text(json.dumps(report))
+    assert [*runs.describe([run])][1].split()[-4:] == ["1.0", "1/2", "0.123", "%"]
+    (run / "report.json").write_text("[]")
+    with raises("RIL-980", "as Rille writes them"):
+        list(runs.describe([run]))
 
 
 @pytest.mark.parametrize("linked", [False, True])
