@@ -133,6 +133,7 @@ LIMITS = {
             "baseline has the wrong sign, or the scene repeats (bricks, tiles)",
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
+        InputLimit("RIL-773", "unlike", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
     ),
     "distortion": (InputLimit("RIL-681", "misread", most=0),),
     "ground": (InputLimit("RIL-679", "above", most=0),),
@@ -395,6 +396,16 @@ def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given
 def judge_sides(beyond: float) -> Finding:
     """Share of the matches that lie beyond infinity under the given rig."""
     return judge("sides", f"{100 * beyond:.1f} % of the matches lie beyond infinity", {"beyond": beyond})
+
+
+def judge_pairs(unlike: Mapping[int, str], tested: int, names: Series[str]) -> Finding:
+    """Pairs, of those ``tested``, that do not fit the rig as the others do; ``unlike``: cause by frame."""
+    if not unlike:
+        return judge("sides", f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence")
+    first, why = next(iter(unlike.items()))
+    figure = "unlike" if 2 * len(unlike) <= tested else "beyond"
+    text = f"{len(unlike)} of {tested} pairs over the sequence do not fit the rig, first frame {names[first]}: {why}"
+    return judge("sides", text, {figure: len(unlike)})
 
 
 def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
