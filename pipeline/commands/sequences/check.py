@@ -173,7 +173,8 @@ class Inspection:
         yield Maybe(list(tests.values()))
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)
-        self.say(judge.judge_pairs(unlike, len(facts), self.sequence.frame_names))
+        swapped = sum(one["swapped"] for one in facts.values())
+        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
         return next((pair for pair in tests if pair not in unlike), whole[0])
 
     def _first_pair(self, pair: int) -> Steps:
