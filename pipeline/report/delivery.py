@@ -37,8 +37,8 @@ def lacking(missing: Items) -> Items:
 def account(scene: Scene, frames: Rows, pairs: Rows, unlike: Sequence[str] = ()) -> dict[str, Any]:
     """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell.
 
-    The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss. ``unlike``: lines
-    on a crosscheck that contradicts the trajectory.
+    The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss.
+    ``unlike``: lines on a crosscheck that contradicts the trajectory.
     """
     view = scene.view
     contradicted = [_item("contradiction", line, "") for line in (*contradictions(view), *unlike)]

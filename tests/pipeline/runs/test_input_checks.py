@@ -190,7 +190,8 @@ def test_sides(share, level):
 
 
 @pytest.mark.parametrize(
-    ("unlike", "swapped", "level", "code"), [(0, 0, "OK", ""), (1, 1, "WARN", "773"), (4, 0, "WARN", "773"), (4, 4, "FAIL", "659")]
+    ("unlike", "swapped", "level", "code"),
+    [(0, 0, "OK", ""), (1, 1, "WARN", "773"), (4, 0, "WARN", "773"), (4, 4, "FAIL", "659")],
 )
 def test_pairs_unlike_the_others(unlike, swapped, level, code):
     found = input_checks.judge_pairs(dict.fromkeys(range(unlike), "why"), 6, swapped, NAMES)

@@ -114,7 +114,9 @@ def test_a_pitch_off_the_ground_is_named_and_the_sign_that_would_fit(stated, see
     assert of_vertical(pitched(*seen), pitched(*[s + 4.0 for s in seen]), None, np.deg2rad(seen[0])) == []
 
 
-@pytest.mark.parametrize(("mount", "slope", "turn", "told"), [(6, 0, 20, 1), (6, 8, 20, 1), (0, 10, 20, 0), (6, 0, 0, 0)])
+@pytest.mark.parametrize(
+    ("mount", "slope", "turn", "told"), [(6, 0, 20, 1), (6, 8, 20, 1), (0, 10, 20, 0), (6, 0, 0, 0)]
+)
 def test_a_vertical_that_is_off_alike_is_told_from_a_slope_where_the_vehicle_turns(mount, slope, turn, told):
     rng, headings = np.random.default_rng(4), np.deg2rad(turn * np.arange(8.0))
     ground = Rotation.from_euler("y", slope, degrees=True).apply([0.0, 0.0, 1.0])
