@@ -156,7 +156,7 @@ def _unlike(figures: Mapping[str, Any]) -> list[str]:
         return []
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
     text = f"trajectory and COLMAP are unlike throughout: {rmse} RMS over {length}; one is wrong"
-    return [f"{text}: do shadows or things in view move, does the ground repeat, or mirror what is above it?"]
+    return [f"{text}: do shadows or things in view move, or does the ground repeat?"]
 
 
 def _resting(trajectory: Bundle | None) -> list[str]:

@@ -130,7 +130,8 @@ LIMITS = {
             "beyond",
             most=0.5,
             remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
-            "baseline has the wrong sign, or the scene repeats (bricks, tiles)",
+            "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
+            "angle between the cameras is off",
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
         InputLimit("RIL-773", "unlike", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
