@@ -34,13 +34,14 @@ def lacking(missing: Items) -> Items:
     return [item for item in missing if item["kind"] not in HARMLESS]
 
 
-def account(scene: Scene, frames: Rows, pairs: Rows) -> dict[str, Any]:
+def account(scene: Scene, frames: Rows, pairs: Rows, unlike: Sequence[str] = ()) -> dict[str, Any]:
     """List ``delivered``, ``absent`` and ``missing`` results as far as the artifacts tell.
 
     The first in words; the others with ``kind``, ``what`` and ``why`` each; what is absent is no loss.
+    ``unlike``: lines on a crosscheck that contradicts the trajectory.
     """
     view = scene.view
-    contradicted = [_item("contradiction", line, "") for line in contradictions(view)]
+    contradicted = [_item("contradiction", line, "") for line in (*contradictions(view), *unlike)]
     missing = contradicted + _poses(frames) + _path(view) + _crosscheck_lost(scene)
     absent = _reference(view) + _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)
     return {"delivered": _delivered(view, frames, pairs), "missing": missing, "absent": absent}

@@ -40,7 +40,7 @@ def collect(view: RunView) -> dict[str, Any]:
     source = view.sequence.truth_source if assessed else "true disparities" if maps else "no truth"
     return {
         "verdict": _verdict(view, frames, pairs, figures),
-        **delivery.account(scene, frames, pairs),
+        **delivery.account(scene, frames, pairs, _unlike(figures)),
         "warnings": find_warnings(scene, figures),
         "seams": _seams(view),
         "sequence": _sequence(view),
@@ -155,7 +155,8 @@ def _unlike(figures: Mapping[str, Any]) -> list[str]:
     if (_value(figures, "agreement_share") or 0.0) <= 15.0:
         return []
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
-    return [f"trajectory and COLMAP are unlike throughout: {rmse} RMS over {length}; one is wrong"]
+    text = f"trajectory and COLMAP are unlike throughout: {rmse} RMS over {length}; one is wrong"
+    return [f"{text}: do shadows or things in view move, or does the ground repeat?"]
 
 
 def _resting(trajectory: Bundle | None) -> list[str]:
@@ -216,12 +217,18 @@ def _sensors(view: RunView) -> list[str]:
         sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
         times = np.array([s.times[f] for f in frames])
         lines += imu_check.of_rotations(world_poses(trajectory)[:, :, :3], sensed, times, axes)
-    shown = [cast(GroundFacts, level.meta) for level in map(view.bundle, levels.values()) if level is not None]
+    shown = {k: cast(GroundFacts, b.meta) for k, level in levels.items() if (b := view.bundle(level)) is not None}
     for source, stated in (("attitude", None), ("pitch", s.pitch)):
-        told = [(facts, up) for facts in shown if facts["source"] == source and (up := seen_up(facts)) is not None]
-        if told:
-            given = np.array([RigidTransform.from_matrix(facts["T_local_left"]).rotation[2] for facts, _ in told])
-            lines += imu_check.of_vertical(given, np.array([up for _, up in told]), axes, stated)
+        told = {k: up for k, facts in shown.items() if facts["source"] == source and (up := seen_up(facts)) is not None}
+        if not told:
+            continue
+        given = np.array([RigidTransform.from_matrix(shown[k]["T_local_left"]).rotation[2] for k in told])
+        contradicted = imu_check.of_vertical(given, (seen := np.array(list(told.values()))), axes, stated)
+        if source == "attitude" and trajectory is not None and not contradicted:
+            turned = world_poses(trajectory)[[trajectory.meta["frames"].index(k) for k in told], :, :3]
+            known = rigid.posed(turned)
+            contradicted = imu_check.of_mount(given[known], seen[known], turned[known])
+        lines += contradicted
     return lines
 
 

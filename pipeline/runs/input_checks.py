@@ -130,9 +130,11 @@ LIMITS = {
             "beyond",
             most=0.5,
             remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
-            "baseline has the wrong sign, or the scene repeats (bricks, tiles)",
+            "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
+            "angle between the cameras is off",
         ),
         InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
+        InputLimit("RIL-773", "unlike", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
     ),
     "distortion": (InputLimit("RIL-681", "misread", most=0),),
     "ground": (InputLimit("RIL-679", "above", most=0),),
@@ -395,6 +397,19 @@ def judge_matching(rate: float | None, depths: Floats, baseline: float, *, given
 def judge_sides(beyond: float) -> Finding:
     """Share of the matches that lie beyond infinity under the given rig."""
     return judge("sides", f"{100 * beyond:.1f} % of the matches lie beyond infinity", {"beyond": beyond})
+
+
+def judge_pairs(unlike: Mapping[int, str], tested: int, swapped: int, names: Series[str]) -> Finding:
+    """Pairs, of those ``tested``, that do not fit the rig as the others do, some of them ``swapped``; ``unlike``: cause
+    by frame."""
+    if not unlike:
+        return judge(
+            "sides", f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
+        )
+    first, why = next(iter(unlike.items()))
+    figure = "beyond" if 2 * swapped > tested else "unlike"
+    text = f"{len(unlike)} of {tested} pairs over the sequence do not fit the rig, first frame {names[first]}: {why}"
+    return judge("sides", text, {figure: len(unlike)})
 
 
 def judge_epipolar(facts: Mapping[str, Any]) -> Finding:

@@ -29,6 +29,8 @@ def readings(lens: Lens) -> dict[str, Lens]:
             found[f"they are those of model {other}"] = replace(lens, model=other)
     if lens.model == "radtan" and len(c) == 5:
         found["they are k1 k2 k3 p1 p2: give k1 k2 p1 p2 k3"] = replace(lens, coefficients=(*c[:2], *c[3:], c[2]))
+    if lens.model == "radtan" and len(c) >= 4:
+        found["they are p1 p2 k1 k2: give k1 k2 p1 p2"] = replace(lens, coefficients=(*c[2:4], *c[:2], *c[4:]))
     return found
 
 

@@ -109,6 +109,40 @@ def of_vertical(given: Floats, seen: Floats, axes: Floats | None, pitch: float |
     ]
 
 
+def of_mount(given: Floats, seen: Floats, images: Floats) -> list[str]:
+    """Warnings if a measured vertical is off by an angle that turns with the vehicle, as by its mount or its zero.
+
+    The normal of the ground, in the frame levelled by the vertical and aligned to the heading, is the sum of a slope of
+    the world, turned by the heading, and of that angle. A drive without turns does not tell one from the other.
+
+    Parameters
+    ----------
+    given, seen : (pair, 3) up in the left camera's frame by the sensor, and by the ground.
+    images : (pair, 3, 3) R_world_left by the images.
+    """
+    levels = np.array([level_rotation(up) for up in given])
+    lean = np.degrees(np.einsum("nij,nj->ni", levels, seen)[:, :2])
+    local = images @ np.swapaxes(levels, 1, 2)
+    heading = np.exp(1j * np.arctan2(local[:, 1, 0] - local[:, 0, 1], local[:, 0, 0] + local[:, 1, 1]))
+    # Per pair two equations of the angle (2,) and of the world's slope (2,), turned back by the heading.
+    design = np.array([[[1, 0, h.real, h.imag], [0, 1, -h.imag, h.real]] for h in heading]).reshape(-1, 4)
+    # Both may be of any size up to what else is named; ground is as uneven as it proves to be, or 1 degree.
+    prior, sigma = np.eye(4) / MAX_SLOPE_DEG**2, 1.0
+    for _ in range(2):
+        information = design.T @ design / sigma**2 + prior
+        answer = np.linalg.solve(information, design.T @ lean.ravel() / sigma**2)
+        sigma = max(1.0, float(np.sqrt(np.mean((lean.ravel() - design @ answer) ** 2))))
+    size, error = np.hypot(*answer[:2]), np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:2, :2])[-1])
+    # 3 degrees: less is within what suspensions give; and five of its standard deviations.
+    if size < max(3.0, 5.0 * error):
+        return []
+    return [
+        f"the measured vertical is off by {size:.1f} +- {error:.1f} degrees: ground that is seen leans so to the same "
+        "side of the vehicle, whichever way it heads, as no slope does: correct T_body_left (T_imu_left), or the "
+        "sensor's zero"
+    ]
+
+
 def names(S: Floats) -> str:
     """Signed axes (3, 3) in words: z, -y, x."""
     return ", ".join(("-" if row.min() < -0.5 else "") + "xyz"[int(np.abs(row).argmax())] for row in S)

@@ -47,10 +47,21 @@ def refuse_mirrored(rig: Rig, left: Floats, right: Floats) -> None:
 def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
     """Refuse matches of which most lie beyond infinity (share ``beyond``), or fit the rig mirrored or sides swapped.
 
-    With sides swapped, matches of parallel cameras lie beyond infinity, those of others on wrong lines.
+    With sides swapped, matches of parallel cameras lie beyond infinity, those of others on wrong lines. Where all of
+    them lie there alike, they may as well show a sky through a camera that is turned.
     """
     refuse_mirrored(rig, left, right)
     swapped, as_given, other_way = exchanged(rig, left, right)
+    low, middle, high = np.quantile(beyond_infinity(rig, left, right), (0.25, 0.5, 0.75))
+    if (swapped or beyond > 0.5) and middle > 0 and high - low < MAX_LINE_DISTANCE_PX * right_pixels(rig):
+        raise DegenerateError(
+            "RIL-772",
+            f"the matches lie {middle:.1f} px beyond infinity, near and far alike (half of them within "
+            f"{high - low:.1f} px)",
+            remedy="if all that is seen is far away (sky, horizon), the angle between the cameras, or a principal "
+            "point, is off by that: calibrate anew, and let the images show near ground; if not, left and right are "
+            "exchanged, or the sign of the baseline is wrong",
+        )
     if swapped:
         raise DegenerateError(
             "RIL-781",

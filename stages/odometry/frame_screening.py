@@ -99,16 +99,9 @@ def judge(
     """
     out = Judgement()
     _see(out, frames, qualities, params)
-    best = max((facts["as_given"] for facts in sides.values() if "as_given" in facts), default=0.0)
-    for f, facts in sides.items():
-        fit = facts.get("as_given", best)
-        if facts["swapped"]:
-            words = f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides"
-            out.lost.setdefault(f, f"{words} exchanged, {fit:.0%} as given)")
-        elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
-            words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
-            out.lost.setdefault(f, f"{words} {best:.0%})")
-            out.late.append(f)
+    for f, words in unlike_sides(sides).items():
+        out.lost.setdefault(f, words)
+        out.late += [] if sides[f]["swapped"] else [f]
     doubted = set(jumps) | _neighbours(frames, out.lost.keys() & sides.keys())
     out.asks["sides"] = [f for f in frames if f in doubted and f not in sides and f not in out.lost]
     chain = [f for f in frames if f not in out.lost]
@@ -127,6 +120,21 @@ def judge(
                     f"{out.unfit[f]}, {shares}" if f in out.unfit else f"not found in its neighbours: {shares}"
                 )
     _leading(out, [f for f in chain if f not in out.lost])
+    return out
+
+
+def unlike_sides(sides: Mapping[int, Mapping[str, Any]]) -> dict[int, str]:
+    """Cause by frame, of those whose left and right do not fit each other; ``sides``: facts of stage ``swap_check``."""
+    best = max((facts["as_given"] for facts in sides.values() if "as_given" in facts), default=0.0)
+    out = dict[int, str]()
+    for f, facts in sides.items():
+        fit = facts.get("as_given", best)
+        if facts["swapped"]:
+            words = f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides"
+            out[f] = f"{words} exchanged, {fit:.0%} as given)"
+        elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
+            words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
+            out[f] = f"{words} {best:.0%})"
     return out
 
 

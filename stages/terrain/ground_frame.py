@@ -260,7 +260,10 @@ def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
     T_local_left = RigidTransform(np.array([x, np.cross(z, x), z]), np.array([0.0, 0.0, reference.height]))
     view = view_matches(samples, T_local_left)
     if not len(view.slant):
-        raise NoGroundError("RIL-392", "all matches may as well be infinitely far: no surface can be measured")
+        remedy = "let the images show what is nearer, use a longer baseline, or check the baseline's unit"
+        raise NoGroundError(
+            "RIL-392", "all matches may as well be infinitely far: no surface can be measured", remedy=remedy
+        )
     cell = rounded_cell(float(np.median(np.sqrt(view.along * view.across))))
     # A match so uncertain has a hundredth of the median one's weight.
     max_sigma = float(f"{10.0 * np.median(samples.sigma_px / view.slope):.2g}")

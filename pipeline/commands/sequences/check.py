@@ -33,6 +33,7 @@ from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import glance
+from rille.stages.odometry.frame_screening import unlike_sides
 
 Steps = Generator[Wait, Any, None]
 
@@ -118,7 +119,7 @@ class Inspection:
         if not whole:
             self.say(judge.judge("matching", "no pair of images is whole", {"whole pairs": 0}))
             return
-        yield from self._first_pair(whole[0])
+        yield from self._first_pair((yield from self._sides(whole)))
         yield from self._motions()
         if len(whole) > 1:
             yield from self._times(whole)
@@ -165,6 +166,16 @@ class Inspection:
             if stuck:
                 text = f"{len(stuck)} {camera} images repeat the one before, first frame {names[stuck[0]]}"
                 yield judge.judge("images", text, {"repeated": len(stuck)})
+
+    def _sides(self, whole: list[int]) -> Generator[Wait, Any, int]:
+        """Whether left and right of some pairs fit each other; the first of these pairs that does."""
+        tests = {pair: self.make.swap_check(pair) for pair in spread(whole, 6)}
+        yield Maybe(list(tests.values()))
+        facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
+        unlike = unlike_sides(facts)
+        swapped = sum(one["swapped"] for one in facts.values())
+        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
+        return next((pair for pair in tests if pair not in unlike), whole[0])
 
     def _first_pair(self, pair: int) -> Steps:
         """Match one pair, and compare it with the rig."""

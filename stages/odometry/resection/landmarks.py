@@ -54,7 +54,9 @@ class Landmarks:
 
     def summary(self) -> str:
         """The counts in words."""
-        return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if count) or "none lost"
+        return (
+            ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if count) or "no others were tracked"
+        )
 
     def take(self, which: NDArray[np.intp]) -> Landmarks:
         """The chosen landmarks."""

@@ -110,7 +110,7 @@ def _ambiguity(
         f"{counts[1]} ({counts[1] / total:.0%}) moved by {moved[1]:.3g} m",
         remedy="the still ones are the nearest: cut the vehicle's own body off the images, or mask it"
         if body
-        else "leave out frames in which the camera stood, or cut off or mask what moves with it"
+        else "leave out frames in which the camera stood, or mask what moves with it or repeats along the way (a fence)"
         if stays
         else "mask what moves by itself, or what repeats along the way (sleepers, tiles)",
     )

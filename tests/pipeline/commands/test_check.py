@@ -102,6 +102,19 @@ def test_swapped_folders_fail(tmp_path, capsys):
     assert "swapped" in line(lines, "sides")
 
 
+def test_a_first_pair_whose_sides_are_exchanged_is_named_and_another_is_matched(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    left, right = path / "left" / "000.png", path / "right" / "000.png"
+    left.rename(path / "old.png")
+    right.rename(left)
+    (path / "old.png").rename(right)
+    code, lines = run(path, capsys)
+    assert code == 0
+    assert "RIL-773: 1 of 4 pairs" in line(lines, "sides")
+    assert "first frame 000: left and right are swapped" in line(lines, "sides")
+    assert "median 4 m" in line(lines, "matching")
+
+
 @pytest.mark.parametrize(("side", "axis"), [("left", 1), ("right", 0)])
 def test_one_camera_that_is_mirrored_fails(tmp_path, capsys, side, axis):
     path = folder(tmp_path / "wall", frames=1)

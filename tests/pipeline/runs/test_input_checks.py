@@ -189,6 +189,16 @@ def test_sides(share, level):
     assert input_checks.judge_sides(share).level == level
 
 
+@pytest.mark.parametrize(
+    ("unlike", "swapped", "level", "code"),
+    [(0, 0, "OK", ""), (1, 1, "WARN", "773"), (4, 0, "WARN", "773"), (4, 4, "FAIL", "659")],
+)
+def test_pairs_unlike_the_others(unlike, swapped, level, code):
+    found = input_checks.judge_pairs(dict.fromkeys(range(unlike), "why"), 6, swapped, NAMES)
+    assert found.level == level
+    assert code in found.code
+
+
 def facts(before: float, after: float, offset: float = 0.0, turn: float = 0.1):
     residuals = {"residual_before_px": before, "residual_after_px": after, "row_offset": offset}
     return residuals | {"roll_deg": 0.1, "turn_deg": turn}

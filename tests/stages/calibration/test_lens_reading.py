@@ -35,6 +35,8 @@ def pairs(true: Lens, given: Lens, rig: Rig = RIG) -> list[PointPairs]:
         (("radtan", RADTAN), ("fisheye", RADTAN), "model radtan"),
         (("fisheye", FISHEYE), ("radtan", FISHEYE), "model fisheye"),
         (("radtan", FIVE), ("radtan", (-0.35, 0.18, -0.06, 0.0005, -0.0003)), "give k1 k2 p1 p2 k3"),
+        (("radtan", RADTAN), ("radtan", (0.0002, 0.00002, -0.28, 0.07)), "give k1 k2 p1 p2"),
+        (("radtan", FIVE), ("radtan", (0.0005, -0.0003, -0.35, 0.18, -0.06)), "give k1 k2 p1 p2"),
         (("radtan", RADTAN), ("radtan", tuple(-c for c in RADTAN)), "the other sign"),
         (("none", ()), ("radtan", RADTAN), "free of distortion"),
         (("radtan", (-0.2, 0.02, 0.0, 0.0)), ("radtan", RADTAN), ""),

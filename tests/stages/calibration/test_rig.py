@@ -240,6 +240,15 @@ def test_swapped_images_are_named():
         facts(street_rig(), pairs)
 
 
+@pytest.mark.parametrize("off", [-2.5, -9.0])
+def test_a_sky_through_a_camera_that_is_turned_is_not_called_swapped(off):
+    rng = np.random.default_rng(2)
+    left = rng.uniform(0, (1225, 369), (600, 2))
+    pairs = [PointPairs(0, left, left + np.stack([rng.normal(-off, 0.3, 600), rng.normal(0, 0.1, 600)], 1))]
+    with raises("RIL-772", "sky"):
+        orient_rig(street_rig(), pairs, RigParams(significance=1e9))
+
+
 def test_images_of_unlike_scenes_are_not_called_swapped():
     rng = np.random.default_rng(2)
     left = rng.uniform(0, (1225, 369), (600, 2))

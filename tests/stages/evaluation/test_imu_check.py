@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rille.stages.evaluation.imu_check import of_rotations, of_vertical
+from rille.stages.evaluation.imu_check import of_mount, of_rotations, of_vertical
 
 AXES = Rotation.from_rotvec([0.02, 0.03, 1.55]).as_matrix()
 TIMES = 0.1 * np.arange(25)
@@ -112,3 +112,16 @@ def test_a_pitch_off_the_ground_is_named_and_the_sign_that_would_fit(stated, see
     assert f"world.pitch_deg = {stated:.3g} contradicts" in line
     assert words in line
     assert of_vertical(pitched(*seen), pitched(*[s + 4.0 for s in seen]), None, np.deg2rad(seen[0])) == []
+
+
+@pytest.mark.parametrize(
+    ("mount", "slope", "turn", "told"), [(6, 0, 20, 1), (6, 8, 20, 1), (0, 10, 20, 0), (6, 0, 0, 0)]
+)
+def test_a_vertical_that_is_off_alike_is_told_from_a_slope_where_the_vehicle_turns(mount, slope, turn, told):
+    rng, headings = np.random.default_rng(4), np.deg2rad(turn * np.arange(8.0))
+    ground = Rotation.from_euler("y", slope, degrees=True).apply([0.0, 0.0, 1.0])
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    images = Rotation.from_rotvec(np.outer(headings, [0, 0, 1])).as_matrix() @ upright
+    off = Rotation.from_euler("z", mount, degrees=True).apply([0.0, -1.0, 0.0])
+    uneven = ground + rng.normal(scale=0.01, size=(8, 3))
+    assert len(of_mount(np.tile(off, (8, 1)), np.einsum("nji,nj->ni", images, uneven), images)) == told

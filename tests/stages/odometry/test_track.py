@@ -146,6 +146,15 @@ def test_untextured_frames_give_no_track_and_no_error():
     assert found.points.shape == (0, 2, 2)
 
 
+def test_frames_of_little_contrast_and_noise_are_tracked():
+    frames, places = sequence([1.0, 1.0], [(0.0, 0.0), (6.0, -4.0)], noise=2.0)
+    faint = [build(100.0 + 0.15 * frame.images[0], PyramidParams(levels=4)) for frame in frames]
+    found = track(faint, motions(places), PARAMS).points
+    error = found[:, 1] - places[1](found[:, 0])
+    assert np.isfinite(error[:, 0]).sum() >= 40
+    assert np.nanmedian(np.abs(error)) < 0.1
+
+
 def test_displacement_is_looked_up_at_the_pixel_centre_of_the_coarse_level():
     column = np.full((5, 5), 7.0, np.float32)
     column[2, 2] = np.nan
