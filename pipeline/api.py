@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import json
 import webbrowser
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -84,25 +83,20 @@ def reconstruct(
     from rille.pipeline.engine.runtime.environment import prepare_environment
 
     prepare_environment()
-    from rille.pipeline.engine.failures import translated
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
-    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq)
+    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq, "seq")
     options = Options(
         assignments=tuple(assignments(settings)),
         frames=frames,
         executor=executor if client is None else client,
-        runs=Path(runs).expanduser(),  # no shell has seen a ~ of a notebook
-        cache=None if cache is None else expanduser(cache),
+        runs=Path(place_of(runs, "runs")),  # no shell has seen a ~ of a notebook
+        cache=None if cache is None else place_of(cache, "cache"),
         quiet=quiet,
     )
-    try:
+    with _translating():
         result = session.perform(given, options)
-    except Exception as error:  # of the system, such as a full disk: `except RilleError` shall catch it as well
-        if (known := translated(error)) is None or known is error:
-            raise
-        raise known from error
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())
@@ -129,7 +123,7 @@ def reconstruct_many(
     ['InputError', 'InputError']
     """
     ended: list[Run | RilleError] = []
-    for seq in [seqs] if isinstance(seqs, str | Path | StereoSequence) else seqs:
+    for seq in [seqs] if isinstance(seqs, str | StereoSequence) or not isinstance(seqs, Iterable) else seqs:
         try:
             ended.append(reconstruct(seq, client, **same))
         except RilleError as error:
@@ -161,7 +155,21 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
     """
     from rille.pipeline.runs import lookup
 
-    return Run(lookup.find(expanduser(path), Path(runs).expanduser()))
+    with _translating():
+        return Run(lookup.find(place_of(path, "path"), Path(place_of(runs, "runs"))))
+
+
+@contextmanager
+def _translating() -> Iterator[None]:
+    """Turn errors of the system, such as a full disk, into those of Rille: `except RilleError` shall catch them."""
+    from rille.pipeline.engine.failures import translated
+
+    try:
+        yield
+    except Exception as error:
+        if (known := translated(error)) is None or known is error:
+            raise
+        raise known from error
 
 
 @dataclass(frozen=True)
