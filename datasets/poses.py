@@ -88,6 +88,12 @@ FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
+ROTATION = re.compile(
+    r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|head|theta|omega|phi|kappa|euler|rodrig|axis|angle).*"
+    r"|(r|q|rv)_?[wxyz]|[rm]_?\d_?\d"
+)
+"""Names of columns of rotations of any kind."""
+
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
 """Name of a column after that of the whole seconds, as in stamps of ROS messages."""
 
@@ -246,6 +252,20 @@ def positions_of(
     rows = _lengths(table, placed, unit)
     warnings += _rounded(rows, table.name)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+
+
+def unread_rotations(table: TextTable) -> tuple[str, ...]:
+    """Warning about columns beside those of positions that seem to hold rotations."""
+    meant = meanings(table)
+    taken = {meant.get(name) for name in ("time", *POSITION)}
+    named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
+    if not named:
+        return ()
+    line = (
+        f"{table.name}: its positions alone are read; its columns {', '.join(named)} are no rotations that are known: "
+    )
+    line += "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
+    return (warning("RIL-749", line),)
 
 
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
