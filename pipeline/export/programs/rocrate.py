@@ -12,7 +12,6 @@ import json
 import mimetypes
 import os
 import shlex
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -38,8 +37,7 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     for name, what, _ in catalogue.listed(run.run):
         if what and (run.run / name).exists():  # files without a description are exports, not files of the run
             refuse_irregular(run.run / name)
-            copy = shutil.copytree if (run.run / name).is_dir() else shutil.copy2
-            copy(run.run / name, folder / name)
+            _copy(run.run / name, folder / name)
             files += list(_files(folder, name, what))
     facts = json.loads(read_text(run.run / "report.json", "report", TABLE))
     if facts["command"].split()[:2] != ["rille", "reconstruct"]:
@@ -51,6 +49,16 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     text = json.dumps({"@context": context, "@graph": graph}, indent=1, ensure_ascii=False)
     (folder / METADATA).write_text(text + "\n", encoding="utf-8")
     return f"{len(files)} files, {len(inputs)} inputs by their digests"
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file or a folder; an error names the target and has the system's number, unlike those of shutil."""
+    if source.is_dir():
+        target.mkdir()
+        for entry in sorted(source.iterdir()):
+            _copy(entry, target / entry.name)
+    else:
+        target.write_bytes(source.read_bytes())
 
 
 def _entity(at: str, kind: str, name: str, **more: Any) -> Entity:
