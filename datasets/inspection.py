@@ -139,6 +139,7 @@ def inspect(folder: Path) -> Findings:
         texts = texts[:MOST_TEXTS]
     find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
+    used |= {name.replace("intrinsic", "extrinsic") for name in used}  # OpenCV's pair of files
     for path in texts:
         relative = _relative(path, folder)
         if path.suffix.lower() not in TABLES or relative in used or any(str(path) in line for line in found.unread):

@@ -298,6 +298,16 @@ def test_calibration_of_both_cameras_is_preferred(tmp_path):
     assert calibration.baseline == pytest.approx(0.1)
 
 
+def test_both_files_of_opencvs_sample_are_read(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    keys = ("M1", "M2")
+    write_lines(tmp_path / "intrinsics.yml", [f"{key}: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]" for key in keys])
+    write_lines(tmp_path / "extrinsics.yml", ["R: [1, 0, 0, 0, 1, 0, 0, 0, 1]", "T: [-0.1, 0, 0]"])
+    found = inspect(tmp_path)
+    assert found.calibration is not None
+    assert (found.calibration.baseline, found.unread) == (pytest.approx(0.1), [])
+
+
 def test_calibration_of_the_images_size_is_preferred(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     for name, size in (("a", (640, 480)), ("b", SIZE), ("c", (128, 96))):
