@@ -24,7 +24,7 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import matrix_at, names_positions, of_images, positions_of
+from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_toml
 from rille.datasets.text.tables import read_table
@@ -350,22 +350,23 @@ def table_kind(path: Path, pairs: int) -> str:
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
-        row = np.array([float(cell) for cell in table.rows[0]])
-    except (InputError, ValueError):  # such as names of images, and dates
+    except InputError:
         return named
+    row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
-    if matrix_at(table) is not None:
+    if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None
     # Without times there must be one for each pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"
-    return _kind_of_row(row, len(table.rows), pairs, named)
+    # Names of images, dates and the like are no numbers.
+    return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:

@@ -203,6 +203,14 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
     assert table_kind(tmp_path / "table.txt", 2) == kind
 
 
+def test_poses_with_cells_of_text_are_found(tmp_path):
+    """As ROS 2 writes them."""
+    names = [*(f"p.position.{a}" for a in "xyz"), *(f"p.orientation.{a}" for a in "xyzw")]
+    lines = [",".join(["header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *names])]
+    write_lines(tmp_path / "p.csv", lines + [f"17000000{k:02d},5,map,{k},0,0,0,0,0,1" for k in range(3)])
+    assert table_kind(tmp_path / "p.csv", 3) == "truth"
+
+
 def test_positions_of_rtklib_are_found(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     row = "2020/09/13 12:26:4{}.0 1 2 3 1 9"
