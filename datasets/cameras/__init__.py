@@ -62,6 +62,7 @@ NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], 
     (has(*opencv.SINGLE), opencv.single),
     (opencv.projections_alone, opencv.projections),
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
+    (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
     (has("value0"), slam.basalt),
     (makers.has_figures, makers.figures),
 )

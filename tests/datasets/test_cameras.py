@@ -529,6 +529,17 @@ def test_basalt(tmp_path, kind, figures, lens):
         read_cameras(written(tmp_path, json.dumps({"value0": values}), "calibration.json"))
 
 
+def test_matrices_in_a_part_for_each_side(tmp_path):
+    one = {"camera_matrix": [[500, 0, 320], [0, 501, 240], [0, 0, 1]], "dist_coeffs": [[0.1, 0, 0, 0, 0.2]]}
+    stated = {"left": one, "right": one, "R": ROTATION.tolist(), "T": SHIFT.reshape(3, 1).tolist(), "rms": 0.2}
+    left, right = read_cameras(written(tmp_path, json.dumps(stated), "stereo.json"))
+    assert left.lens == right.lens == Lens(Camera(500, 501, 320, 240, *UNKNOWN_SIZE), "radtan", (0.1, 0, 0, 0, 0.2))
+    np.testing.assert_allclose(right.T_camera_reference.translation, SHIFT)
+    stated["left"] = one | {"distortion": [1, 2, 3]}
+    with raises("RIL-810", "left_distortion"):
+        read_cameras(written(tmp_path, json.dumps(stated), "stereo.json"))
+
+
 FIGURES = {"fx": 460.0, "fy": 461.0, "cx": 363.0, "cy": 248.0, "width": 752, "height": 480}
 
 
