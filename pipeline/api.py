@@ -178,6 +178,9 @@ class Run:
 
     folder: Path
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(place_of(self.folder, "folder")))
+
     @cached_property
     def report(self) -> Mapping[str, Any]:
         """All facts of the report (``report.json``)."""

@@ -187,8 +187,11 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
     for nothing in (None, tmp_path):
         with raises("RIL-866", "locus.cell_size"):
             rille.reconstruct(sequence, locus={"cell_size": nothing})
-    with raises("RIL-862"):
-        _ = rille.Run(tmp_path).terrain
+    for folder in (tmp_path, str(tmp_path)):
+        with raises("RIL-862"):
+            _ = rille.Run(folder).terrain  # type: ignore[arg-type]
+    with raises("RIL-970", "folder=None"):
+        rille.Run(None)  # type: ignore[arg-type]
     with pytest.raises(AttributeError):
         _ = rille.nothing
 
