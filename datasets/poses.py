@@ -89,7 +89,7 @@ NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
 ROTATION = re.compile(
-    r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|head|theta|omega|phi|kappa|euler|rodrig|axis|angle).*"
+    r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|heading|theta|omega|phi|kappa|euler|rodrig|axis_?angle).*"
     r"|(r|q|rv)_?[wxyz]|[rm]_?\d_?\d"
 )
 """Names of columns of rotations of any kind."""

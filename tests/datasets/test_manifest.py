@@ -581,6 +581,7 @@ def test_whole_seconds_stay_times(tmp_path, rate):
         ("r11,r21,r31,r12,r22,r32,r13,r23,r33", "r11, r21"),
         ("heading [deg],fix,v", "heading [deg]"),
         ("vx,vy,sats", ""),
+        (".header.seq,steering_angle,axis", ""),
     ],
 )
 def test_rotations_that_are_not_read_are_told(tmp_path, columns, unread):
