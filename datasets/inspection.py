@@ -24,7 +24,8 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import matrix_at, names_positions, of_images, positions_of
+from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
+from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -56,7 +57,7 @@ class FoundImages:
     sides : the words or letters in the names that mark left and right.
     absent : missing files of pairs, which are counted in ``pairs``.
     lines : on the pairing by time stamps in the names, if these differ.
-    others : patterns of the left images of other sets of pairs.
+    others : lines on images that are of another set of pairs, or of none.
     """
 
     left: str
@@ -130,7 +131,7 @@ def inspect(folder: Path) -> Findings:
         text = "; ".join([error.message, *search.closed[:1], *unread(strange)])
         raise InputError(error.code, text, remedy=error.remedy) from error
     found.unread += search.closed
-    found.unread += [f"{of} and its right images: of another set" for of in found.views.others]
+    found.unread += found.views.others
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
@@ -138,6 +139,7 @@ def inspect(folder: Path) -> Findings:
         texts = texts[:MOST_TEXTS]
     find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
+    used |= {name.replace("intrinsic", "extrinsic") for name in used}  # OpenCV's pair of files
     for path in texts:
         relative = _relative(path, folder)
         if path.suffix.lower() not in TABLES or relative in used or any(str(path) in line for line in found.unread):
@@ -202,6 +204,10 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         for neutral, side, path in found:
             groups[row, f"{place} {words.get(neutral, '')}"][side].append(path)
     both = {key: sides for key, sides in groups.items() if all(sides)}
+    frames = {(row, re.sub(r"\d+", "", place)) for row, place in both}
+    if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
+        left, right = ([sides[k][0] for sides in both.values()] for k in (0, 1))
+        both = {min(both): (left, right)}
     if not both and (parts := pairing.by_one_word(names)):
         (first, ours), (second, theirs) = parts.items()
         both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
@@ -228,6 +234,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
+    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
+    paired = {path for of in both.values() for path in (*of[0], *of[1])}
+    alone = [_relative(path, folder) for path in images if path not in paired]
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -239,7 +248,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
-        tuple(pattern(sides[0], folder) for place, sides in both.items() if place != key),
+        (*others, *([f"{count(len(alone), 'image')} ({alone[0]} ...): of neither camera by name"] if alone else ())),
     )
 
 
@@ -249,13 +258,14 @@ def _place(path: Path, without: str) -> str:
 
 
 def pattern(paths: list[Path], folder: Path) -> str:
-    """The narrowest simple pattern of a set of files in one folder (or in one folder for each side)."""
+    """The narrowest simple pattern of a set of files in one folder, or in folders of one depth."""
     names = [path.name for path in paths]
     if len({path.suffix for path in paths}) > 1:  # searches ignore the case of suffixes
         names = [path.stem + path.suffix.lower() for path in paths]
-    below = {_relative(path.parent, folder) for path in paths}
-    place = "" if below == {"."} else (glob.escape(min(below)) if len(below) == 1 else "**") + "/"
-    if len(names) == 1:
+    below = {path.parent.relative_to(folder).parts for path in paths}
+    alike = [glob.escape(min(part)) if len(set(part)) == 1 else "*" for part in zip(*below, strict=False)]
+    place = "".join(f"{part}/" for part in (alike if len(set(map(len, below))) == 1 else ["**"]))
+    if len(set(names)) == 1:
         return place + glob.escape(names[0])
     head = _common_start(names).rstrip("0123456789")
     tail = _common_start([name[len(head) :][::-1] for name in names])[::-1].lstrip("0123456789")
@@ -340,22 +350,23 @@ def table_kind(path: Path, pairs: int) -> str:
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
-        row = np.array([float(cell) for cell in table.rows[0]])
-    except (InputError, ValueError):  # such as names of images, and dates
+    except InputError:
         return named
+    row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
-    if matrix_at(table) is not None:
+    if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None
     # Without times there must be one for each pair.
     if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
         return "positions"
-    return _kind_of_row(row, len(table.rows), pairs, named)
+    # Names of images, dates and the like are no numbers.
+    return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
 
 
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:

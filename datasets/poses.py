@@ -2,7 +2,7 @@
 
 Forms of a file, one pose T_reference_body per row:
 
-* ``kitti``: 3 x 4 (or 4 x 4) numbers, row-major, perhaps after a time;
+* ``kitti``: 3 x 4 (or 4 x 4) numbers, row by row (4 x 4 perhaps column by column), perhaps after a time;
 * ``tum``: time, x y z, quaternion x y z w;
 * ``euroc``: time, x y z, quaternion w x y z, perhaps other columns;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
@@ -87,6 +87,12 @@ FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
+
+ROTATION = re.compile(
+    r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|heading|theta|omega|phi|kappa|euler|rodrig|axis_?angle).*"
+    r"|(r|q|rv)_?[wxyz]|[rm]_?\d_?\d"
+)
+"""Names of columns of rotations of any kind."""
 
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
 """Name of a column after that of the whole seconds, as in stamps of ROS messages."""
@@ -248,6 +254,20 @@ def positions_of(
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
 
 
+def unread_rotations(table: TextTable) -> tuple[str, ...]:
+    """Warning about columns beside those of positions that seem to hold rotations."""
+    meant = meanings(table)
+    taken = {meant.get(name) for name in ("time", *POSITION)}
+    named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
+    if not named:
+        return ()
+    line = (
+        f"{table.name}: its positions alone are read; its columns {', '.join(named)} are no rotations that are known: "
+    )
+    line += "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
+    return (warning("RIL-749", line),)
+
+
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
     """Warning about coordinates (n, 2 or 3), m, in single precision, rounded to centimetres or more."""
     single = places.astype(np.float32)
@@ -298,9 +318,11 @@ def _column(table: TextTable, stated: str | int) -> int:
 
 
 def meanings(table: TextTable) -> dict[str, int]:
-    """Columns by the meaning of their names."""
+    """Columns by the meaning of their names; no column whose name stands twice, as x of a place and of a quaternion."""
     columns: dict[str, int] = {}
     for k, name in enumerate(table.header):
+        if table.header.count(name) > 1:
+            continue
         bare = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
         matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
         meant = next((meaning(match) for match, meaning in matches if match), None)
@@ -400,7 +422,11 @@ def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:
     columns, warnings = range(timed, table.columns), tuple[str, ...]()
     if timed:  # else rows are frames
         table, warnings = table.measured(range(table.columns), (table.values(columns[:12]) == 0).all(axis=1))
-    values = table.numbers(columns, gaps=True).reshape(len(table.rows), -1, 4)[:, :3]
+    values = table.numbers(columns, gaps=True).reshape(len(table.rows), -1, 4)
+    largest = np.nan_to_num(np.abs(values)).max(axis=0)
+    if len(largest) == 4 and largest[3, :3].any() and not largest[:3, 3].any():
+        values = values.transpose(0, 2, 1)  # column by column
+    values = values[:, :3].copy()
     values[:, :, 3] *= unit
     poses = tuple(
         None if np.isnan(m).any() or not m.any() else rounded_pose(m, f"{table.name}, line {line}")

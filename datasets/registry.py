@@ -119,7 +119,12 @@ def open_sequence(
 
 
 def _opened(name_or_path: str, digests: Digests) -> Sequence:
-    return masked(examined(_of_files(name_or_path, digests)), digests)
+    sequence = masked(examined(_of_files(name_or_path, digests)), digests)
+    # Each warning names the sequence, or a file of it.
+    places = name_or_path, str(Path(name_or_path).resolve().parent)
+    said = (line.split(": ", 1) for line in sequence.warnings)
+    lines = (": ".join([code, *([] if text.startswith(places) else [name_or_path]), text]) for code, text in said)
+    return replace(sequence, warnings=tuple(lines))
 
 
 def _of_files(name_or_path: str, digests: Digests) -> Sequence:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import json
 import webbrowser
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from os.path import expanduser
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -91,21 +90,17 @@ def reconstruct(
     from rille.pipeline.runs import session
     from rille.pipeline.runs.options import Options
 
-    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq)
+    given = seq.source if isinstance(seq, StereoSequence) else place_of(seq, "seq")
     options = Options(
         assignments=tuple(assignments(settings)),
         frames=frames,
         executor=executor if client is None else client,
-        runs=Path(runs).expanduser(),  # no shell has seen a ~ of a notebook
-        cache=None if cache is None else expanduser(cache),
+        runs=Path(place_of(runs, "runs")),  # no shell has seen a ~ of a notebook
+        cache=None if cache is None else place_of(cache, "cache"),
         quiet=quiet,
     )
-    try:
+    with _translating():
         result = session.perform(given, options)
-    except Exception as error:  # of the system, such as a full disk: `except RilleError` shall catch it as well
-        if (known := translated(error)) is None or known is error:
-            raise
-        raise known from error
     result.print()
     # Absolute: the program may change its folder, or send the run to another.
     return Run(result.folder.resolve())
@@ -132,7 +127,7 @@ def reconstruct_many(
     ['InputError', 'InputError']
     """
     ended: list[Run | RilleError] = []
-    for seq in [seqs] if isinstance(seqs, str | Path | StereoSequence) else seqs:
+    for seq in [seqs] if isinstance(seqs, str | StereoSequence) or not isinstance(seqs, Iterable) else seqs:
         try:
             ended.append(reconstruct(seq, client, **same))
         except RilleError as error:
@@ -162,7 +157,19 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
     Traceback (most recent call last):
     rille.stages.core.errors.ConfigError: no run 'mockup-shrot': no/such/folder holds none
     """
-    return Run(lookup.find(expanduser(path), Path(runs).expanduser()))
+    with _translating():
+        return Run(lookup.find(place_of(path, "path"), Path(place_of(runs, "runs"))))
+
+
+@contextmanager
+def _translating() -> Iterator[None]:
+    """Turn errors of the system, such as a full disk, into those of Rille: `except RilleError` shall catch them."""
+    try:
+        yield
+    except Exception as error:
+        if (known := translated(error)) is None or known is error:
+            raise
+        raise known from error
 
 
 @dataclass(frozen=True)
@@ -170,6 +177,9 @@ class Run:
     """The results of a run, in its ``folder``; each is read when it is asked for."""
 
     folder: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(place_of(self.folder, "folder")))
 
     @cached_property
     def report(self) -> Mapping[str, Any]:

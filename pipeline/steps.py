@@ -24,10 +24,9 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field, replace
-from operator import index
 from os.path import expanduser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import tomli_w
@@ -35,7 +34,7 @@ from numpy.typing import NDArray
 
 from rille.datasets import registry
 from rille.datasets.images.files import sound
-from rille.datasets.protocol import Sequence
+from rille.datasets.protocol import CAMERAS, Sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import prepare_environment
@@ -58,6 +57,8 @@ Known = dict[Handle, Bundle]
 @dataclass(frozen=True)
 class StereoSequence:
     """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are.
+
+    ``sequence[START:STOP]`` and a loop give pairs whose images can be used.
 
     Attributes
     ----------
@@ -87,18 +88,27 @@ class StereoSequence:
     def __len__(self) -> int:
         return self.source.frames
 
-    def __getitem__(self, frame: int) -> StereoPair:
-        number = index(frame)
-        number += len(self) if number < 0 else 0
-        if not 0 <= number < len(self):
-            raise IndexError(f"pair {frame} of {len(self)}")
+    @overload
+    def __getitem__(self, frame: int) -> StereoPair: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[StereoPair]: ...
+    def __getitem__(self, frame: int | slice) -> StereoPair | list[StereoPair]:
+        try:
+            number = range(len(self))[frame]
+        except IndexError:
+            raise IndexError(f"pair {frame} of {len(self)}") from None
+        except (TypeError, ValueError):
+            text = f"{frame!r:.80} is no number of a pair"
+            raise InputError("RIL-747", text, remedy="give a whole number, or START:STOP[:STEP]") from None
+        if isinstance(number, range):
+            return [StereoPair(self, k) for k in number if k not in self.source.lost]
         if number in self.source.lost:
             text = f"frame {number} of {self.name}: {self.source.lost[number]}"
             raise InputError("RIL-863", text, remedy="take another frame")
         return StereoPair(self, number)
 
     def __iter__(self) -> Iterator[StereoPair]:
-        return (self[k] for k in range(len(self)) if k not in self.source.lost)
+        return iter(self[:])
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,8 @@ class StereoPair:
 
     def taken(self, camera: str) -> NDArray[Any]:
         """Grey values (row, col) of an image as camera ``left`` or ``right`` took it, with its lens distortion."""
+        if camera not in CAMERAS:
+            raise ConfigError("RIL-748", f"there is no camera {camera!r:.80}", remedy="give 'left' or 'right'")
         image = _computed(_builder(self, self.settings).raw_image(self.frame, camera), {}, self.sequence.drawn)
         return np.array(image["image"])
 
@@ -172,7 +184,7 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     (9, ('row', 'col'))
     """
     words = assignments(settings)
-    opened = registry.open_sequence(place_of(path), config.merge({}, settings))
+    opened = registry.open_sequence(place_of(path, "path"), config.merge({}, settings))
     said = (word for one in words for word in ("--set", one))
     return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
 
@@ -182,11 +194,13 @@ def _reopened(path: str, *assigned: str) -> StereoSequence:
     return open(path, **config.parse_assignments(assigned[1::2]))
 
 
-def place_of(path: object) -> str:
-    """Name or path of a sequence, as a command line has it; what can be none is refused."""
-    if not isinstance(path, str | Path):
-        text = f"a {type(path).__name__} is no name or path of a sequence"
-        raise InputError("RIL-970", text, remedy="give one; rille.reconstruct also takes what rille.open returns")
+def place_of(path: object, name: str) -> str:
+    """A name or path as a command line has it, from argument ``name``; what can be none is refused."""
+    if not isinstance(path, str | Path) or "\0" in str(path):
+        remedy = "give a text or a Path"
+        if name == "seq":
+            remedy += ", or what rille.open returns, with frames='START:STOP' for a part of it"
+        raise InputError("RIL-970", f"{name}={path!r:.80} is no name or path", remedy=remedy)
     return expanduser(path)
 
 
@@ -269,8 +283,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     carried = _settings(left)
     built: Any = config.build(carried, {"hfvm": hfvm})
     left, right = map(_rows_first, (left, right))
-    images = [np.asarray(image) for image in (left, right)]
-    for camera, image in zip(("left", "right"), images, strict=True):
+    images = [_pixels(image) for image in (left, right)]
+    for camera, image in zip(CAMERAS, images, strict=True):
         if image.dtype.kind in "OSU":  # a path, or nothing
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
             raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
@@ -290,6 +304,14 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)
     return _dataset(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+
+
+def _pixels(image: Any) -> AnyArray:
+    """An image as an array; the name of its type if it is none."""
+    try:
+        return np.asarray(image)
+    except (TypeError, ValueError):  # a Dataset, or rows of unlike lengths
+        return np.asarray([type(image).__name__])
 
 
 def _rows_first(image: Any) -> Any:
@@ -477,7 +499,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
 
     limits: dict[str, Any] = {}
     if isinstance(vehicle, str | Path):
-        read = read_toml(Path(vehicle), "configuration")
+        read = read_toml(Path(place_of(vehicle, "vehicle")), "configuration")
         limits = read.get("vehicle", read)
     elif vehicle is not None:
         check_sections({"vehicle": vehicle})

@@ -18,10 +18,10 @@ from rille.stages.core.errors import InputError
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
-    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal and VINS, BoofCV, "
+    "OpenCV (YAML, XML), ROS camera_info, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, BoofCV, "
     "ZED .conf, DepthAI, COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, "
-    "CAHVORE) are read; of another program write K1, D1, K2, D2, R and T (metres; MATLAB's K and R transposed) as "
-    "OpenCV's YAML"
+    "CAHVORE) are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; "
+    "MATLAB's K and R transposed), as OpenCV's YAML"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -62,6 +62,9 @@ NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], 
     (has(*opencv.SINGLE), opencv.single),
     (opencv.projections_alone, opencv.projections),
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
+    (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
+    (has("value0"), slam.basalt),
+    (makers.has_figures, makers.figures),
 )
 """Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are
 unrectified."""

@@ -1,6 +1,6 @@
 """Calibrations of stereo cameras and data sets by their makers.
 
-ZED's ``.conf``, OAK's JSON (DepthAI), ``K.txt``, and Middlebury's rectified pairs (2014 and 2021).
+ZED's ``.conf``, OAK's JSON (DepthAI), ``K.txt``, Middlebury's rectified pairs (2014 and 2021), and figures by key.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, paralle
 from rille.datasets.cameras.text import assignments, entries
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
+
+CAMERAS = ("left", "right")
 
 SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]([^\[]*)", re.MULTILINE)
 ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
@@ -135,6 +137,30 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     if "baseline" not in f:
         return [CalibratedCamera(path.stem, lens)]
     return stereo_cameras(lens, lens, parallel(f.number("baseline")))
+
+
+def _parts(f: Fields) -> list[Fields]:
+    """Entries of the left and of the right camera, or those of the file, which are of one camera."""
+    sides = [f.sub(side) for side in CAMERAS if isinstance(f.values.get(side), dict)]
+    return [side for side in sides if "fx" in side] or [f]
+
+
+def has_figures(f: Fields) -> bool:
+    """Whether there are fx, fy, cx and cy (RealSense: ppx and ppy) of one camera, or of ``left`` and ``right``."""
+    return all("fx" in part and "fy" in part and ("cx" in part or "ppx" in part) for part in _parts(f))
+
+
+def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of a file with a number for each key, as scripts write it; parallel, with ``baseline``, metres."""
+    lenses = []
+    for part in _parts(f):
+        pinhole, fisheye = "fx fy ppx ppy" if "ppx" in part else "fx fy cx cy", part.model("k1") == "fisheye"
+        model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("radtan", "k1 k2 p1 p2 k3")
+        lenses.append(part.optics(pinhole, model, keys, part.size("width", "height")))
+    if "baseline" in f:
+        return stereo_cameras(lenses[0], lenses[-1], parallel(f.number("baseline")))
+    names = CAMERAS if lenses[1:] else [path.stem]
+    return [CalibratedCamera(name, lens) for name, lens in zip(names, lenses, strict=True)]
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:

@@ -68,6 +68,21 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
 
 
+def by_side(f: Fields) -> Fields:
+    """Entries with those of ``left`` and ``right`` among them: ``left_K`` for K of ``left``."""
+    parts = {side: f.values.get(side) for side in ("left", "right")}
+    flat = {
+        f"{side}_{key}": value for side, of in parts.items() if isinstance(of, Mapping) for key, value in of.items()
+    }
+    return Fields({**{key: value for key, value in f.values.items() if key not in parts}, **flat}, f.file, f.at, f.used)
+
+
+def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of a file with camera matrix and distortion in a part for each side."""
+    f.values = by_side(f).values
+    return stereo(f, path)
+
+
 def projections_alone(f: Fields) -> bool:
     """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before rectification."""
     return "P1" in f and "P2" in f and not any(key in f for key in (*ROTATIONS, *TRANSLATIONS))

@@ -1,4 +1,4 @@
-"""Calibrations of visual-inertial programs: Kalibr's camchain, EuRoC's sensor.yaml, ORB-SLAM, camodocal and VINS."""
+"""Calibrations of visual-inertial programs: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS and Basalt."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
@@ -15,6 +17,13 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
 CAMERA = re.compile(r"cam(\d+)")
+
+BASALT: Mapping[str, tuple[str, str]] = {
+    "pinhole": ("none", ""),
+    "kb4": ("fisheye", "k1 k2 k3 k4"),
+    "pinhole-radtan8": ("rational", "k1 k2 p1 p2 k3 k4 k5 k6"),
+}
+"""Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`, keys of its coefficients."""
 
 CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
     "PINHOLE": ("fx fy cx cy", "radtan", "k1 k2 p1 p2"),
@@ -78,6 +87,29 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
         cameras += [replace(camera, name=name, T_camera_reference=T) for camera in camodocal(part, other)]
         part.check_lens()
     return cameras
+
+
+def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of Basalt's JSON: ``T_imu_cam`` maps each camera to the IMU by a quaternion, metres."""
+    from scipy.spatial.transform import Rotation
+
+    f = f.sub("value0")
+    cameras, poses, sizes = (
+        Fields(dict(enumerate(f.get(key))), f.file, f"{f.at}{key}.", f.used)
+        for key in ("intrinsics", "T_imu_cam", "resolution")
+    )
+    found = []
+    for k in cameras.values:
+        camera, pose = cameras.sub(k), poses.sub(k)
+        kind, q = camera.text("camera_type"), np.array([pose.number(f"q{axis}") for axis in "xyzw"])
+        if kind not in BASALT:
+            raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
+        if abs(np.linalg.norm(q) - 1) > 0.01:
+            raise pose.error("RIL-767", "qx, qy, qz, qw", f"have length {np.linalg.norm(q):.4g}, it should be 1")
+        lens = camera.sub("intrinsics").optics("fx fy cx cy", *BASALT[kind], sizes.pair_of_pixels(k))
+        T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
+        found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
+    return found
 
 
 def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:

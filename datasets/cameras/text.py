@@ -6,7 +6,9 @@ Values stay text, or None where the file gives none; :mod:`rille.datasets.camera
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 from xml.etree import ElementTree
 
@@ -26,6 +28,9 @@ END = re.compile(r"^---[ \t]*$", re.MULTILINE)
 
 STAMPED = re.compile(r"\A\s*header:[ \t]*\n([ \t]+.*\n)*")
 """The header, which differs between messages of a topic."""
+
+TOML = re.compile(r"\s*([#;].*\s+)*(\[[\w. /-]+\][ \t]*$|[\w.-]+[ \t]*=)", re.MULTILINE)
+"""Beginning of a file of TOML, or of one with the ending .ini."""
 
 TWICE = "{} stands there twice, with two values"
 
@@ -74,7 +79,11 @@ def assignments(text: str) -> list[tuple[str, str]]:
 
 
 def parse_nested(text: str, file: str) -> Mapping[Any, Any]:
-    """Entries of XML, YAML or JSON, whichever it is (see :func:`parse_xml` and :func:`parse_yaml`)."""
+    """Entries of XML, TOML, YAML or JSON, whichever it is (see :func:`parse_xml` and :func:`parse_yaml`)."""
+    if TOML.match(text):
+        with suppress(tomllib.TOMLDecodeError, RecursionError):
+            return tomllib.loads(text)
+        return {}  # not even YAML
     return parse_xml(text, file) if text.lstrip().startswith("<") else parse_yaml(text, file)
 
 

@@ -61,12 +61,13 @@ def opened(file: BinaryIO) -> Any:
 
 
 def orientation(image: Any) -> int:
-    """EXIF's orientation of an image of Pillow; 1 if it states none."""
+    """EXIF's orientation of an image of Pillow, 2 to 8; 1 if it states none or another."""
     # Parsers of damaged tags raise anything.
     with catch_warnings(action="ignore"), suppress(Exception):
         # 0x0112: EXIF's orientation: 1 as stored, 3 upside down, 6 and 8 turned by a quarter, others mirrored.
         # Not for a PNG without EXIF, which Pillow would decode as a whole to search for it.
-        return int(image.getexif().get(0x0112, 1)) if image.format != "PNG" or "exif" in image.info else 1
+        stated = int(image.getexif().get(0x0112, 1)) if image.format != "PNG" or "exif" in image.info else 1
+        return stated if 1 <= stated <= 8 else 1
     return 1
 
 

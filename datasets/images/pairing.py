@@ -239,7 +239,8 @@ def pair_up(
     left, right : image files of each camera.
     rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which all differ),
         ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest
-        where time stamps differ, and number where the names of the two cameras have nothing in common.
+        where time stamps differ, number where the names of the two cameras have nothing in common, and the folder
+        where each frame has its own and all files of a camera have one name.
     gaps : images that are paired by name and have no partner make a pair with an absent file, as long as they are
         fewer than the whole pairs.
     growing : images after the last pair, by name or number, are left out, since their partners are still to come.
@@ -277,7 +278,11 @@ def pair_up(
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
     rule = rule if rule != "auto" else "name" if shared else "number"
-    by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
+    by_key = _by_folder(left, 0), _by_folder(right, 1)
+    if [len(of) for of in by_key] == [len(left), len(right)]:
+        rule = "folder"
+    else:
+        by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
     if growing:
         by_key = _up_to_last_pair(*by_key)
     shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
@@ -296,6 +301,12 @@ def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
     stems = in_order([without_side(path.stem, side) for path in paths])
     place = {stem: k for k, stem in enumerate(stems)}
     return sorted(paths, key=lambda path: (place[without_side(path.stem, side)], natural(path.name)))
+
+
+def _by_folder(paths: Sequence[Path], side: int) -> dict[str, Path]:
+    """Images by their folder without the side's token, where each frame has its own and all have one name."""
+    places = {without_side(path.parent.as_posix(), side): path for path in sorted(paths, key=lambda p: natural(str(p)))}
+    return places if len({path.name for path in paths}) == 1 < len(paths) else {}
 
 
 def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:

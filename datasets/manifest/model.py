@@ -61,7 +61,8 @@ class Images(Table):
         BAG:TOPIC.
     right : that of the right images, or the same bag.
     pair : how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp
-        in it, or by order; auto: by name, by time stamps where these differ, else by number.
+        in it, or by order; auto: by name, by time stamps where these differ, else by number; by folder where each frame
+        has its own.
     tolerance : s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the
         usual interval, at most 0.01.
     rectified : whether the images are rectified; by default they are where a word of their folders' or files' names

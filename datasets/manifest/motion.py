@@ -27,6 +27,7 @@ from rille.datasets.poses import (
     positions_of,
     read_motion,
     refuse_apart,
+    unread_rotations,
 )
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
@@ -45,7 +46,6 @@ TIME = re.compile("time|stamp", re.IGNORECASE)
 """Part of the title of a column of times."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
-NUMBERS_AS_TIMES = 'names = true with unit = "s" takes those in the names of the images for seconds'
 
 
 @dataclass
@@ -192,20 +192,7 @@ class MotionReader:
         self.warn(timed.warnings)
         poses: Poses = timed.poses
         if timed.times is not None:
-            if self.sequence.times is None:
-                text = f"the poses of {path} have times, but the pairs have none"
-                numbered = all(t == int(t) for t in timed.times)
-                remedy = NEEDS_TIMES + (f"; if they are numbers of frames, {NUMBERS_AS_TIMES}" if numbered else "")
-                raise InputError("RIL-231", text, remedy=remedy)
-            moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times))
-            poses = interpolate(moved, self.sequence.times, section.max_gap)
-            self.warn(coverage(poses, self.sequence.times, f"{table} ({path.name})"))
-            if 2 * sum(pose is not None for pose in poses) < len(poses):
-                self.refuse_sparse(section, moved.times or (), table)
-            if table == "truth":
-                left = np.zeros(3) if section.T_body_left is None else np.array(section.T_body_left)[3::4]
-                track = tuple(tuple(pose.apply(left).tolist()) for pose in moved.poses if pose)
-                self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
+            poses = self.of_numbers(timed, section) or self.of_times(timed, section, table)
         elif timed.images:
             poses = self.of_images(timed)
         elif (one_a_pair := self.one_a_pair(poses)) is not None:
@@ -218,6 +205,40 @@ class MotionReader:
             return poses
         T_body_left = RigidTransform.from_matrix(section.T_body_left)
         return tuple(pose and pose @ T_body_left for pose in poses)
+
+    def of_times(self, timed: TimedPoses, section: PoseFile | Attitude, table: str) -> Poses:
+        """The pose at the time of each pair; None where the file has none about that time."""
+        path, at = self.root / section.file, self.sequence.times
+        if at is None:
+            raise InputError("RIL-231", f"the poses of {path} have times, but the pairs have none", remedy=NEEDS_TIMES)
+        moved = replace(timed, times=tuple(t + section.time_offset for t in timed.times or ()))
+        poses = interpolate(moved, at, section.max_gap)
+        self.warn(coverage(poses, at, f"{table} ({path.name})"))
+        if 2 * sum(pose is not None for pose in poses) < len(poses):
+            self.refuse_sparse(section, moved.times or (), table)
+        if table == "truth":
+            left = np.zeros(3) if section.T_body_left is None else np.array(section.T_body_left)[3::4]
+            track = tuple(tuple(pose.apply(left).tolist()) for pose in moved.poses if pose)
+            self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
+        return poses
+
+    def of_numbers(self, timed: TimedPoses, section: PoseFile | Attitude) -> Poses | None:
+        """The pose of each pair whose number, in the name of its left image, stands in place of a time in the file.
+
+        None: what stands there are times, or numbers of other images.
+        """
+        times, at = timed.times or (0.5,), np.array(self.sequence.times or (), dtype=np.float64)
+        # Seconds, if half of the pairs are at a row; pairs ten a second are within 0.15 s of one in three of ten cases.
+        there = (at >= times[0] - 0.15) & (at <= times[-1] + 0.15) & (np.abs(at - at.round()) <= 0.15)
+        if any(t != int(t) for t in times) or section.max_gap >= 1 or 2 * np.count_nonzero(there) >= len(self.pairs):
+            return None
+        known = dict(zip(map(int, times), timed.poses, strict=True))
+        numbers = [int(["-1", *re.findall(r"\d+", pair.left.stem)][-1]) for pair in self.pairs]
+        poses = tuple(map(known.get, numbers))
+        if 2 * sum(pose is not None for pose in poses) < len(poses) or len(set(numbers)) < len(numbers):
+            return None
+        self.state(notes=(*self.sequence.notes, f"{section.file} has poses by the numbers in the names of the images"))
+        return poses
 
     def of_images(self, timed: TimedPoses) -> Poses:
         """The pose of each left image, by its name in the file; None for images that the file does not name.
@@ -246,6 +267,7 @@ class MotionReader:
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
             self.state(truth_positions=self.true_positions(section, alone))
+            self.warn(() if section.columns else unread_rotations(rows))
             return
         if section.lever_arm is not None:
             text = f"truth.lever_arm: {section.file} holds poses, not positions alone"

@@ -33,8 +33,10 @@ def translated(error: BaseException) -> RilleError | None:
     library = type(error).__module__.split(".")[0]
     if library == "cv2":
         return RilleError("RIL-738", f"OpenCV cannot do this: {error}", remedy="check the images and their sizes")
-    if library == "rasterio":
-        return RilleError("RIL-739", f"cannot write or read a raster: {error}", remedy="check the space in --runs")
+    if library in ("rasterio", "lazrs"):
+        what = "a raster" if library == "rasterio" else "a cloud of points"
+        remedy = "check the space in --runs or --output"
+        return RilleError("RIL-739", f"cannot write or read {what}: {error}", remedy=remedy)
     return None
 
 

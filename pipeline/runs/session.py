@@ -107,8 +107,8 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
     nobody = unread.foreign(driven=driven) | ({"terrain.reference"} if driven else set())
     unread.refuse(settled.given, settled.config, nobody, who)
     rig = judge_rig(sequence.rig)
-    # A manifest warns about its baseline itself, with the key to change.
-    if rig.level != "OK" and not any("baseline" in line for line in sequence.warnings):
+    # A manifest warns about its baseline itself, with the key to change; code and place stand before the words.
+    if rig.level != "OK" and not any("baseline" in line.split(": ", 2)[-1] for line in sequence.warnings):
         sequence = replace(sequence, warnings=(*sequence.warnings, f"{rig.code}: {rig.text}: {rig.remedy}"))
     for line in sequence.warnings:
         warn(line)

@@ -496,6 +496,90 @@ def test_vins_names_a_file_a_camera(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("kind", "figures", "lens"),
+    [
+        ("pinhole", {}, ("none", ())),
+        ("kb4", {"k1": 0.01, "k2": 0.0, "k3": 0.002, "k4": 0.0}, ("fisheye", (0.01, 0.0, 0.002, 0.0))),
+        (
+            "pinhole-radtan8",
+            {"k1": 0.1, "p2": 0.2, "k6": 0.3, "rpmax": 1.5},
+            ("rational", (0.1, 0, 0, 0.2, 0, 0, 0, 0.3)),
+        ),
+        ("ds", {"xi": -0.2, "alpha": 0.6}, None),
+    ],
+)
+def test_basalt(tmp_path, kind, figures, lens):
+    camera = {"camera_type": kind, "intrinsics": {"fx": 460.0, "fy": 461.0, "cx": 363.0, "cy": 248.0, **figures}}
+    half = np.sqrt(0.5)  # each camera looks along x of the IMU, right is -y
+    poses = [{"px": 0.1, "py": y, "pz": 0.0, "qx": -0.5, "qy": 0.5, "qz": -0.5, "qw": 0.5} for y in (0.06, -0.05)]
+    values = {"T_imu_cam": poses, "intrinsics": [camera] * 2, "resolution": [[752, 480]] * 2, "accel_noise_std": [0.1]}
+    path = written(tmp_path, json.dumps({"value0": values}), "calibration.json")
+    if lens is None:
+        with raises("RIL-768", "camera_type", "ds"):
+            read_cameras(path)
+        return
+    left, right = read_cameras(path)
+    assert left.lens == Lens(Camera(460, 461, 363, 248, 752, 480), *lens)
+    rig, _ = rig_of(left, right)
+    np.testing.assert_allclose(rig.T_right_left.translation, [-0.11, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(left.T_camera_reference.inverse().rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    poses[1]["qw"] = half
+    with raises("RIL-767", "T_imu_cam.1"):
+        read_cameras(written(tmp_path, json.dumps({"value0": values}), "calibration.json"))
+
+
+def test_matrices_in_a_part_for_each_side(tmp_path):
+    one = {"camera_matrix": [[500, 0, 320], [0, 501, 240], [0, 0, 1]], "dist_coeffs": [[0.1, 0, 0, 0, 0.2]]}
+    stated = {"left": one, "right": one, "R": ROTATION.tolist(), "T": SHIFT.reshape(3, 1).tolist(), "rms": 0.2}
+    left, right = read_cameras(written(tmp_path, json.dumps(stated), "stereo.json"))
+    assert left.lens == right.lens == Lens(Camera(500, 501, 320, 240, *UNKNOWN_SIZE), "radtan", (0.1, 0, 0, 0, 0.2))
+    np.testing.assert_allclose(right.T_camera_reference.translation, SHIFT)
+    stated["left"] = one | {"distortion": [1, 2, 3]}
+    with raises("RIL-810", "left_distortion"):
+        read_cameras(written(tmp_path, json.dumps(stated), "stereo.json"))
+
+
+FIGURES = {"fx": 460.0, "fy": 461.0, "cx": 363.0, "cy": 248.0, "width": 752, "height": 480}
+
+
+@pytest.mark.parametrize("ending", ["json", "yaml", "toml"])
+@pytest.mark.parametrize("sides", [False, True])
+def test_figures_by_key(tmp_path, ending, sides):
+    one = FIGURES | {"k1": 0.1, "p2": 0.2}
+    stated = {"baseline": 0.12, "left": one, "right": one | {"fx": 470.0}} if sides else one | {"baseline": 0.12}
+    text = json.dumps(stated)
+    if ending == "toml":
+        lines = (
+            {k: v for k, v in stated.items() if not isinstance(v, dict)},
+            *(stated.get(s, {}) for s in ("left", "right")),
+        )
+        text = "\n".join(
+            f"{head}\n" + "\n".join(f"{k} = {v}" for k, v in of.items())
+            for head, of in zip(("#", "[left]", "[right]"), lines, strict=True)
+        )
+    left, right = read_cameras(written(tmp_path, text, f"own.{ending}"))
+    assert left.lens == Lens(Camera(460, 461, 363, 248, 752, 480), "radtan", (0.1, 0, 0, 0.2))
+    assert right.lens.camera.fx == (470 if sides else 460)
+    np.testing.assert_allclose(centre(right.T_camera_reference), [0.12, 0, 0], atol=1e-12)
+
+
+def test_figures_without_a_baseline_are_cameras_and_an_unread_lens_is_refused(tmp_path):
+    real = {"fx": 1.0, "fy": 1.0, "ppx": 2.0, "ppy": 3.0, "model": "distortion.brown_conrady", "coeffs": [0.0] * 5}
+    left, right = read_cameras(written(tmp_path, json.dumps({"left": real, "right": real})))
+    assert (left.name, right.name, left.T_camera_reference) == ("left", "right", None)
+    (camera,) = read_cameras(written(tmp_path, json.dumps(FIGURES), "front.yaml"))
+    assert (camera.name, camera.size) == ("front", (752, 480))
+    real["coeffs"] = [0.1, 0, 0, 0, 0]
+    with raises("RIL-810", "left.coeffs"):
+        read_cameras(written(tmp_path, json.dumps({"left": real, "right": real})))
+
+
+def test_an_ini_file_is_no_camera(tmp_path):
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, "# oST version 5.0\n\n[image]\n\nwidth\n640\n\n[left]\ncamera matrix\n1 0 2\n"))
+
+
 @pytest.mark.parametrize("bf", [226.746, -226.746])
 def test_orbslam2_baseline_times_fx_of_either_sign(tmp_path, bf):
     text = f"{ORB}Camera.width: 1280\nCamera.height: 960\nCamera.k1: 0.0\nCamera.bf: {bf} #969.0 * 0.234\n"

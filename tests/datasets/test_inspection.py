@@ -13,7 +13,8 @@ from raising import raises
 
 from rille.datasets.images.files import Digests
 from rille.datasets.inspection import find_views, inspect, pattern, table_kind
-from rille.datasets.manifest.opening import open_manifest
+from rille.datasets.manifest.model import read_manifest
+from rille.datasets.manifest.opening import find_pairs, open_manifest
 from rille.datasets.manifest.text import manifest_text, needs
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.names import derived_name
@@ -69,6 +70,10 @@ def both(template: str, names: list[str]) -> list[str]:
         (both("{side}/{name}", ["1.png", "2.PNG"]), "left/*.png", "right/*.png", 2),
         ([f"{side}/{k}.png" for side in ("droite", "gauche") for k in (1, 2)], "gauche/*.png", "droite/*.png", 2),
         (both("{name}_{side}_7.png", ["day1", "day2"]), "day*_left_7.png", "day*_right_7.png", 2),
+        (both("f{name}/{side}.png", ["9", "10", "11"]), "*/left.png", "*/right.png", 3),
+        (both("a/{name}/{side}/x.png", ["9", "10"]), "a/*/left/x.png", "a/*/right/x.png", 2),
+        ([f"{k:03d}/v_{c}.png" for k in range(3) for c in (3, 4)], "*/v_3.png", "*/v_4.png", 3),
+        (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
     ],
 )
 def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
@@ -76,6 +81,22 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     views = inspect(tmp_path).views
     assert (views.left, views.right, views.pairs, views.trouble) == (left, right, pairs, "")
     assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
+
+
+@pytest.mark.parametrize("name", ["{k}/{side}.png", "{k}/{side}/x.png", "{side}/{k}/x.png"])
+def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path, name):
+    write_images(tmp_path, [name.format(k=k, side=side) for k in (9, 10, 11) for side in ("left", "right")])
+    views = inspect(tmp_path).views
+    head, cameras = "[cameras]\nfx = 60.0\ncx = 31.5\ncy = 23.5\n", "[rig]\nbaseline = 0.1\n"
+    text = f'[images]\nleft = "{views.left}"\nright = "{views.right}"\n{head}{cameras}'
+    (tmp_path / "m.toml").write_text(text)
+    pairs = find_pairs(read_manifest(tmp_path / "m.toml").images, tmp_path, [], Digests())
+    for k, pair in zip((9, 10, 11), pairs, strict=True):
+        places = [path.relative_to(tmp_path).as_posix() for path in (pair.left, pair.right)]
+        assert places == [name.format(k=k, side=side) for side in ("left", "right")]
+    (tmp_path / name.format(k=10, side="right")).unlink()
+    with raises("RIL-259", "folder"):
+        open_sequence(str(tmp_path / "m.toml"))
 
 
 @pytest.mark.parametrize(
@@ -182,6 +203,14 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
     assert table_kind(tmp_path / "table.txt", 2) == kind
 
 
+def test_poses_with_cells_of_text_are_found(tmp_path):
+    """As ROS 2 writes them."""
+    names = [*(f"p.position.{a}" for a in "xyz"), *(f"p.orientation.{a}" for a in "xyzw")]
+    lines = [",".join(["header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *names])]
+    write_lines(tmp_path / "p.csv", lines + [f"17000000{k:02d},5,map,{k},0,0,0,0,0,1" for k in range(3)])
+    assert table_kind(tmp_path / "p.csv", 3) == "truth"
+
+
 def test_positions_of_rtklib_are_found(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
     row = "2020/09/13 12:26:4{}.0 1 2 3 1 9"
@@ -275,6 +304,16 @@ def test_calibration_of_both_cameras_is_preferred(tmp_path):
     assert calibration is not None
     assert calibration.files == ("rig.yaml",)
     assert calibration.baseline == pytest.approx(0.1)
+
+
+def test_both_files_of_opencvs_sample_are_read(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    keys = ("M1", "M2")
+    write_lines(tmp_path / "intrinsics.yml", [f"{key}: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]" for key in keys])
+    write_lines(tmp_path / "extrinsics.yml", ["R: [1, 0, 0, 0, 1, 0, 0, 0, 1]", "T: [-0.1, 0, 0]"])
+    found = inspect(tmp_path)
+    assert found.calibration is not None
+    assert (found.calibration.baseline, found.unread) == (pytest.approx(0.1), [])
 
 
 def test_calibration_of_the_images_size_is_preferred(tmp_path):

@@ -22,6 +22,7 @@ from rille.datasets.manifest import model
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest
 from rille.datasets.protocol import Sequence
+from rille.datasets.registry import open_sequence
 from rille.datasets.text.validation import known_keys, tables
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -541,6 +542,59 @@ def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
         opened(path)
 
 
+ONE = "1 0 0 {} 0 1 0 0 0 0 1 0"
+
+
+@pytest.mark.parametrize("stamps", ["", "[times]\nrate_hz = 10\n", '[times]\nfile = "t.txt"\n'])
+@pytest.mark.parametrize("row", ["{0} " + ONE, "{0} " + ONE + " 0 0 0 1", "{0} {1} 0 0 0 0 0 1"])
+def test_poses_by_the_numbers_of_the_images(tmp_path, stamps, row):
+    """As in KITTI-360: a number stands in place of a time, and not all images have a pose."""
+    write_lines(tmp_path / "t.txt", [f"2013-05-28 08:46:0{k}.904512000" for k in range(6)])
+    path = write_sequence(tmp_path, stamps + '[truth]\nfile = "p.txt"\n', frames=6)
+    numbers = [1, 2, 4, 5]
+    row = row.replace("{}", "{1}")
+    write_lines(tmp_path / "p.txt", [row.format(k, 0.5 * k) for k in numbers])
+    s = opened(path)
+    assert s.truth is not None
+    assert {k: pose.translation[0] for k, pose in enumerate(s.truth) if pose} == {k: 0.5 * k for k in numbers}
+    assert any("numbers" in note for note in s.notes)
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_whole_seconds_stay_times(tmp_path, rate):
+    text = f'[times]\nrate_hz = {rate}\n[truth]\nfile = "p.txt"\n'
+    path = write_sequence(tmp_path, text, frames=5)
+    write_lines(tmp_path / "p.txt", [tum(k, 7 + k) for k in range(5)])
+    s = opened(path)
+    assert s.truth is not None
+    assert [pose and pose.translation[0] for pose in s.truth] == [
+        7 + k / rate if k % rate == 0 else None for k in range(5)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("columns", "unread"),
+    [
+        ("rx,ry,rz", "rx, ry, rz"),
+        ("rvec_0,rvec_1,rvec_2", "rvec_0"),
+        ("qx,qy,qz", "qx"),
+        ("r11,r21,r31,r12,r22,r32,r13,r23,r33", "r11, r21"),
+        ("heading [deg],fix,v", "heading [deg]"),
+        ("vx,vy,sats", ""),
+        (".header.seq,steering_angle,axis", ""),
+    ],
+)
+def test_rotations_that_are_not_read_are_told(tmp_path, columns, unread):
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 1\n[truth]\nfile = "p.csv"\nmax_gap = 1\n')
+    zeros = ",1" * (columns.count(",") + 1)
+    write_lines(tmp_path / "p.csv", [f"time,x,y,z,{columns}", *(f"{k},{k},0,0{zeros}" for k in range(3))])
+    s = opened(path)
+    assert s.truth_positions is not None
+    assert [unread in line for line in s.warnings if "RIL-749" in line] == [True] * bool(unread)
+    path.write_text(path.read_text() + 'columns = { x = "x", y = "y", time = "time" }\n')
+    assert not opened(path).warnings
+
+
 @pytest.mark.parametrize(
     ("text", "lines", "expected"),
     [
@@ -550,7 +604,8 @@ def test_bad_truth_of_positions_alone(tmp_path, more, lines, expected):
             ["frame time,qw,qx,qy,qz", "7,1,0,0,0"],
             ("RIL-230", "frame time", "is called time"),
         ),
-        ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(1, 1)], ("RIL-231", "p.txt", "[ti", "numbers of frames")),
+        ('[truth]\nfile = "p.txt"\n', [tum(0, 0), tum(0.5, 1)], ("RIL-231", "p.txt", "[ti")),
+        ('[truth]\nfile = "p.txt"\n', [tum(7, 0), tum(8, 1)], ("RIL-231", "p.txt", "[ti")),
         ('[truth]\nfile = "nothing.txt"\n', [], ("RIL-138", "nothing.txt")),
     ],
 )
@@ -612,6 +667,8 @@ def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, fil
     (tmp_path / "calib.txt").write_text(rows)
     sequence = opened(write_sequence(tmp_path, cameras='[cameras]\nfile = "calib.txt"\n', rig=f"[rig]\n{unit}"))
     assert [line for line in sequence.warnings if "square of the chessboard" in line] == [*sequence.warnings][:doubted]
+    by_name = open_sequence(str(tmp_path / "rover.rille.toml"))
+    assert [line.split(": ")[1] for line in by_name.warnings] == [str(tmp_path / "rover.rille.toml")] * doubted
 
 
 # -- bad input, one line each ------------------------------------------------------------------------------------------

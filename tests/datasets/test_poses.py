@@ -331,3 +331,28 @@ def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):
     (tmp_path / "p.csv").write_text("time,x_deg,y_deg\n1,15,47\n2,15,47\n")
     with raises("RIL-995", "x_deg"):
         positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
+
+
+@pytest.mark.parametrize("timed", [False, True])
+def test_matrices_column_by_column_are_turned(tmp_path, timed):
+    poses = [RigidTransform(rotation_exp([0.1, 0.2 * k, 0.3]), [k, 2.0, 3.0]) for k in range(3)]
+    rows = [np.vstack([pose.matrix34, [0, 0, 0, 1]]).T.ravel() for pose in poses]
+    rows[1:1] = [] if timed else [np.full(16, np.nan)]
+    lines = [" ".join(map(str, [*([k] if timed else []), *row])) for k, row in enumerate(rows)]
+    (tmp_path / "p.txt").write_text("\n".join(lines))
+    found = [pose for pose in poses_of(read_motion(tmp_path / "p.txt")).poses if pose]
+    for pose, read in zip(poses, found, strict=True):
+        np.testing.assert_allclose(read.matrix34, pose.matrix34, atol=1e-12)
+
+
+def test_names_of_columns_that_stand_twice_mean_nothing(tmp_path):
+    """As in tables of motion capture: x, y, z of the quaternion come first."""
+    lines = ["frame,time,x,y,z,w,x,y,z", *(f"{k},{k},0,0,0,1,{k},2,3" for k in range(3))]
+    (tmp_path / "take.csv").write_text("\n".join(lines))
+    table = read_motion(tmp_path / "take.csv")
+    assert positions_of(table, "auto", {}) is None
+    with raises("RIL-264", "x, y, z, w, x, y, z"):
+        poses_of(table)
+    found = positions_of(table, "auto", {"x": 7, "y": 8, "z": 9})
+    assert found is not None
+    assert found.positions == tuple((float(k), 2.0, 3.0) for k in range(3))

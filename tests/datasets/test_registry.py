@@ -10,6 +10,8 @@ from raising import raises
 from rille.datasets import registry
 from rille.datasets.registry import MANIFESTS, catalogue, open_sequence
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.runs.options import Work
+from rille.pipeline.runs.session import settings_of_run
 
 
 def test_every_listed_name_opens():
@@ -262,3 +264,13 @@ def test_an_installed_package_adds_a_layout_and_the_current_folder_none(installe
     monkeypatch.setattr(registry.sysconfig, "get_path", lambda name: str(installed))
     assert open_sequence(str(tmp_path / "field")).name == "mine"
     assert ("FOLDER", "one with a file my.format") in catalogue()
+
+
+@pytest.mark.parametrize("folder", ["seq", "baseline"])
+def test_another_warning_about_the_place_of_the_baseline_is_none_about_the_baseline(tmp_path, folder):
+    """The focal lengths differ much, and a principal point is off."""
+    figures = "{{ fx = {}, cx = 31.5, cy = {} }}"
+    cameras = f"[cameras]\nleft = {figures.format(60.0, 35.5)}\nright = {figures.format(400.0, 23.5)}\n"
+    path = write_sequence(tmp_path / folder, cameras=cameras)
+    lines = settings_of_run(str(path), Work(), warn=lambda _: None).sequence.warnings
+    assert {line[:7] for line in lines} == {"RIL-689", "RIL-642"}

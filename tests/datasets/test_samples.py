@@ -136,7 +136,7 @@ def test_a_damaged_tag_is_none(tmp_path):
     assert open_sequence(str(path)).frames == 2
 
 
-@pytest.mark.parametrize(("tag", "said"), [(None, 0), (1, 0), (3, 1), (6, 1)])
+@pytest.mark.parametrize(("tag", "said"), [(None, 0), (0, 0), (1, 0), (3, 1), (6, 1), (99, 0)])
 def test_like_orientations_are_ignored_and_said(tmp_path, tag, said):
     sequence = open_sequence(str(turned(tmp_path, {"left": tag, "right": tag})))
     assert sum("RIL-829" in line for line in sequence.warnings) == said

@@ -171,16 +171,27 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
         rille.open("mockup-short", frames=3)  # type: ignore[arg-type]
     for nothing in (None, sequence[0], [sequence[0]]):
         for take in (rille.open, rille.reconstruct):
-            with raises("RIL-970", type(nothing).__name__):
+            with raises("RIL-970", f"{nothing!r:.80}"):
                 take(nothing)  # type: ignore[operator]
+    for place in (None, 3, b"runs", "a\0b"):
+        for name in ["runs"] if place is None else ["runs", "cache"]:
+            with raises("RIL-970", f"{name}={place!r}"):
+                rille.reconstruct(sequence, **{name: place})  # type: ignore[arg-type]
+        with raises("RIL-970", f"path={place!r}"):
+            rille.open_run(place)  # type: ignore[arg-type]
+    with raises("RIL-737", "a" * 5000):
+        rille.open_run("a" * 5000)
     for number in (2, slice(0, 2), [0, 1]):
         with raises("RIL-055", repr(number)):
             rille.reconstruct(sequence, frames=number, runs=tmp_path, cache=tmp_path / "cache")  # type: ignore[arg-type]
     for nothing in (None, tmp_path):
         with raises("RIL-866", "locus.cell_size"):
             rille.reconstruct(sequence, locus={"cell_size": nothing})
-    with raises("RIL-862"):
-        _ = rille.Run(tmp_path).terrain
+    for folder in (tmp_path, str(tmp_path)):
+        with raises("RIL-862"):
+            _ = rille.Run(folder).terrain  # type: ignore[arg-type]
+    with raises("RIL-970", "folder=None"):
+        rille.Run(None)  # type: ignore[arg-type]
     with pytest.raises(AttributeError):
         _ = rille.nothing
 
@@ -193,8 +204,8 @@ def test_settings_come_back_from_their_assignments(value: object) -> None:
 
 
 def test_one_sequence_may_stand_for_a_list_of_one() -> None:
-    for one in ("no-such-sequence", Path("no/such/folder")):
-        (error,) = rille.reconstruct_many(one)
+    for one in ("no-such-sequence", Path("no/such/folder"), None, rille.open("mockup-short", mockup=MOCKUP)[0]):
+        (error,) = rille.reconstruct_many(one)  # type: ignore[arg-type]
         assert isinstance(error, rille.RilleError)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         pair.sequence[3]
     assert pair.sequence[-1].frame == 2
     assert [p.frame for p in pair.sequence] == [0, 1, 2]
+    with raises("RIL-748", "'middle'"):
+        pair.taken("middle")
     with raises("RIL-864", "rille.terrain"):
         rille.hazards(xarray.Dataset())
     for step, other, maker in (
@@ -202,10 +205,9 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
             rille.hazards(changed)
     with raises("RIL-674", "rille.open(...)[0]"):
         rille.terrain(disparity, pair.sequence)
-    with pytest.raises(TypeError, match="Dataset"):
-        rille.match(disparity, pair.right)
-    with raises("RIL-675", "left.png"):
-        rille.match("left.png", pair.right)
+    for image, name in ((disparity, "Dataset"), ([[1, 2], [3]], "list"), ("left.png", "left.png")):
+        with raises("RIL-675", name):
+            rille.match(image, pair.right)
     with raises("RIL-865", "(260, 285)"):
         rille.terrain(disparity.isel(row=slice(5)), pair)
     with raises("RIL-027", "hfvm.no"):
@@ -228,8 +230,11 @@ def test_what_a_user_draws_into_an_image_stays_with_them() -> None:
 def test_pairs_are_counted_by_whole_numbers(pair: rille.StereoPair) -> None:
     sequence = pair.sequence
     assert sequence[-1] == sequence[np.int64(2)] == sequence[2]
-    for wrong in (slice(0, 2), "000000", 1.0):
-        with pytest.raises(TypeError, match="integer"):
+    assert [p.frame for p in sequence[::-2]] == [2, 0]
+    lossy = rille.StereoSequence(replace(sequence.source, lost={1: "no left image"}))
+    assert [p.frame for p in lossy[0:3]] == [p.frame for p in lossy] == [0, 2]
+    for wrong in ("000000", 1.0, None, [0, 1], slice("a"), slice(0, 3, 0)):
+        with raises("RIL-747", repr(wrong)):
             _ = sequence[wrong]  # type: ignore[index]
     assert repr(sequence) == "<StereoSequence mockup-short: 3 pairs>"
 
