@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
 
 import cv2
 import lazrs
@@ -21,7 +20,6 @@ from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.export.programs import rocrate
 
 
 def opencv_error() -> cv2.error:
@@ -67,19 +65,6 @@ def test_a_link_that_leads_nowhere_and_a_folder_that_was_removed_are_named(tmp_p
             path.mkdir()
         assert "runs is a link to /scratch/gone, which is missing" in str(translated(caught.value))
     assert "current folder was removed" in str(translated(FileNotFoundError(errno.ENOENT, "No such file")))
-
-
-def test_a_crate_on_a_full_disk_says_so(tmp_path, monkeypatch):
-    (tmp_path / "run/terrain.zarr").mkdir(parents=True)
-    (tmp_path / "run/terrain.zarr/0.0").write_bytes(b"cells")
-    copied = tmp_path / "copied"
-    rocrate._copy(tmp_path / "run", copied)
-    assert (copied / "terrain.zarr/0.0").read_bytes() == b"cells"
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/there/0.0")
-    monkeypatch.setattr(Path, "write_bytes", lambda *_: (_ for _ in ()).throw(full))
-    with pytest.raises(OSError, match="/there") as caught:
-        rocrate._copy(tmp_path / "run", tmp_path / "crate")
-    assert "/there/0.0" in str(translated(caught.value))
 
 
 def test_other_errors_are_left_as_they_are():
