@@ -159,8 +159,9 @@ def test_runs(place: Place) -> None:
     rows = {line.split()[0]: line.split()[1:] for line in first.lines[1:]}
     assert len(rows) == 6
     for run in place.runs("other"):
-        state, computed, cached, seconds = rows[f"other/{run.name}"]
+        state, computed, cached, seconds, posed, *_ = rows[f"other/{run.name}"]
         assert state == "complete"
+        assert len(set(posed.split("/"))) == 1
         assert (int(computed) > 0) == (run == place.runs("other")[0])
         assert int(computed) + int(cached) > 0 < float(seconds)
     assert place.rille("runs", "other").lines[1:] == [line for line in first.lines[1:] if line.startswith("other/")]

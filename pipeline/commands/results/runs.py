@@ -7,13 +7,15 @@ import os
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from rille.datasets.text.count import count
+from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, RilleError
 
 
 def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> None:
@@ -47,17 +49,17 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
             seconds = facts.get("total", facts.get("seconds"))
             took = "" if seconds is None else f"{seconds:.1f}"
-            posed, drift = _trajectory(run / "report.json")
+            posed, drift = _trajectory(run)
             yield f"{lookup.name(run):44s} {state:12s} {counts} {took:>8s} {posed:>9s} {drift:>8s}".rstrip()
 
 
-def _trajectory(report: Path) -> tuple[str, str]:
-    """Frames with a pose, and drift, of a report; empty: there is none, or no truth."""
-    if not report.exists():
-        return "", ""
-    said = json.loads(report.read_text(encoding="utf-8"))
-    frames, drift = said["frames"], said["metrics"].get("trajectory_drift", {}).get("value")
-    return f"{sum(frame['posed'] for frame in frames)}/{len(frames)}", "" if drift is None else f"{drift:.3g} %"
+def _trajectory(run: Path) -> tuple[str, str]:
+    """Frames with a pose, and drift; empty where there is no report, or not as Rille writes it."""
+    with suppress(RilleError), lookup.reading(run):
+        report = json.loads(read_text(run / "report.json", "report", TABLE))
+        frames, drift = report["frames"], report["metrics"].get("trajectory_drift", {}).get("value")
+        return f"{sum(frame['posed'] for frame in frames)}/{len(frames)}", "" if drift is None else f"{drift:.3g} %"
+    return "", ""
 
 
 def timing(run: Run = "latest", *, runs: Runs = RUNS) -> None:
