@@ -136,8 +136,8 @@ def test_interrupted_at_random_moments(programs, calm, tmp_path, row, executor, 
     row(f"Ctrl-C, {executor}", tries, lost, wrong, recomputed, expected, f"left within {slowest:.1f} s")
 
 
-DEATHS = ("task", "mkdir:1", "fsync:1", "link:1", "linked:1", "fsync:2", "replace:1")
-PUBLISHED = ("linked:1", "fsync:2", "replace:1")
+DEATHS = ("task", "mkdir:1", "fsync:1", "link:1", "linked:1", "unlink:1")
+PUBLISHED = ("linked:1", "unlink:1")
 """When these deaths come, the artifact is there."""
 
 
@@ -187,7 +187,7 @@ def test_poison_takes_a_few_workers_each_and_nothing_else_along(programs, calm, 
     found = program.run(cache=str(cache), executor="dask", sabotage=poison, tally=str(tally))
     failed = {label: n["why"] for label, n in found["nodes"].items() if n["status"] == "failed"}
     assert set(failed) == {f"saboteur/{p}" for p in poison}
-    assert all(why.startswith("WorkerDiedError: 2 worker processes died") for why in failed.values())
+    assert all(why.startswith("RilleError: 2 worker processes died") for why in failed.values())
     deaths = {p.name: p.stat().st_size for p in tally.iterdir()}
     assert set(deaths) == set(poison)
     assert set(deaths.values()) <= {2, 3, 4}, "two once nothing else ran; before, dask counts deaths by others, too"
@@ -215,7 +215,7 @@ def test_a_worker_out_of_memory_is_named_with_its_memory(programs, calm, tmp_pat
     hog = found["nodes"]["saboteur/memory"]
     assert hog["status"] == "failed"
     assert "the last was ended at" in hog["why"]
-    assert hog["why"].startswith("WorkerDiedError: 2 worker processes died")
+    assert hog["why"].startswith("RilleError: 2 worker processes died")
     wrong = [n for n, digest in calm["labels"].items() if found["nodes"][n]["digest"] != digest]
     computed = statuses(found, "computed")
     row(

@@ -1,6 +1,6 @@
 """Kills the process that runs it: while it computes, in its commit, or by its memory; the first times only.
 
-``what`` is ``task``, ``fsync:2``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
+``what`` is ``task``, ``fsync:1``, ``link:1`` ... (the process dies before that call of the commit), ``linked:1`` (after
 it), ``poison`` (each time), ``memory`` (it takes more than the worker may have), ``random`` (no death, but another
 result in each process, once two are there).
 """
