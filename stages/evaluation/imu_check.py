@@ -120,6 +120,8 @@ def of_mount(given: Floats, seen: Floats, images: Floats) -> list[str]:
     given, seen : (pair, 3) up in the left camera's frame by the sensor, and by the ground.
     images : (pair, 3, 3) R_world_left by the images.
     """
+    if not len(given):
+        return []
     levels = np.array([level_rotation(up) for up in given])
     lean = np.degrees(np.einsum("nij,nj->ni", levels, seen)[:, :2])
     local = images @ np.swapaxes(levels, 1, 2)

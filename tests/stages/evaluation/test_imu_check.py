@@ -125,3 +125,7 @@ def test_a_vertical_that_is_off_alike_is_told_from_a_slope_where_the_vehicle_tur
     off = Rotation.from_euler("z", mount, degrees=True).apply([0.0, -1.0, 0.0])
     uneven = ground + rng.normal(scale=0.01, size=(8, 3))
     assert len(of_mount(np.tile(off, (8, 1)), np.einsum("nji,nj->ni", images, uneven), images)) == told
+
+
+def test_of_no_pair_with_a_pose_nothing_is_said():
+    assert of_mount(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3))) == []
