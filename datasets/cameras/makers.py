@@ -15,10 +15,9 @@ from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.cameras.text import assignments, entries
+from rille.datasets.protocol import CAMERAS
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
-
-CAMERAS = ("left", "right")
 
 SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]([^\[]*)", re.MULTILINE)
 ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)

@@ -12,6 +12,7 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.cameras.text import parse_nested
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
@@ -70,7 +71,7 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def by_side(f: Fields) -> Fields:
     """Entries with those of ``left`` and ``right`` among them: ``left_K`` for K of ``left``."""
-    parts = {side: f.values.get(side) for side in ("left", "right")}
+    parts = {side: f.values.get(side) for side in CAMERAS}
     flat = {
         f"{side}_{key}": value for side, of in parts.items() if isinstance(of, Mapping) for key, value in of.items()
     }

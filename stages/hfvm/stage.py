@@ -35,7 +35,7 @@ __all__ = ["OUTPUTS", "HfvmParams", "StereoMatches", "facts", "hfvm_stage", "mat
 
 Map = NDArray[np.float32]
 
-DEFAULT = MatchOptions()
+DEFAULT_OPTIONS = MatchOptions()
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def match(
     params: HfvmParams | None = None,
     *,
     valid: tuple[AnyArray | None, AnyArray | None] = (None, None),
-    options: MatchOptions = DEFAULT,
+    options: MatchOptions = DEFAULT_OPTIONS,
 ) -> StereoMatches:
     """Dense disparity vectors from ``left`` to ``right``, searched in two dimensions.
 
@@ -99,7 +99,9 @@ def match(
     return match_pyramids(a, b, params or HfvmParams(), options)
 
 
-def match_pyramids(left: Pyramid, right: Pyramid, params: HfvmParams, options: MatchOptions = DEFAULT) -> StereoMatches:
+def match_pyramids(
+    left: Pyramid, right: Pyramid, params: HfvmParams, options: MatchOptions = DEFAULT_OPTIONS
+) -> StereoMatches:
     """Match two image pyramids as :func:`match` does."""
     if params.preset in WHOLE:
         arrays, unlike = paper.match(left, right, params, options.tell), ImageDifference()

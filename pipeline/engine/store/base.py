@@ -114,9 +114,8 @@ class Store:
                 # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares
                 # what was touched
                 if use and status.st_mtime < time.time() - 3600.0:
-                    with suppress(
-                        OSError
-                    ):  # by such rights nobody clears it up; if it has just gone, its reader says so
+                    # Without the rights for it nobody clears it up; if it has just gone, its reader says so.
+                    with suppress(OSError):
                         os.utime(path)
                 return known or manifest.reference(self.read_manifest(stage, key), status.st_size)
         except FileNotFoundError:
