@@ -422,7 +422,8 @@ class Manifest(Table):
     Attributes
     ----------
     name : short name, used for folders; the manifest's folder by default.
-    root : folder of all files, relative to the manifest; ${VARIABLE} is allowed.
+    root : folder of all files, relative to the manifest; ${VARIABLE} is allowed. Paths and patterns of files may be
+        absolute.
     defaults : parameters that suit the sequence, e.g. locus.cell_size = 0.05.
     notes : facts that the report repeats.
     """

@@ -213,7 +213,8 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
         for path in paths:
             writable(path.name)
         if not paths:
-            text = "; ".join([f"images.{side} = {pattern!r} finds no file in {root}", *search.closed[:1]])
+            within_root = "" if pattern.startswith("/") else f" in {root}"
+            text = "; ".join([f"images.{side} = {pattern!r} finds no file{within_root}", *search.closed[:1]])
             raise IncompleteError("RIL-217", text, remedy="correct the pattern, root or rights")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))

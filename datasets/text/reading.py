@@ -278,18 +278,20 @@ class Search:
                 return
 
     def matching(self, root: Path, pattern: str) -> list[Path]:
-        """Files whose path below ``root`` matches a pattern, the suffix in any case; ``**`` stands for any folders.
+        """Files that match a pattern below ``root``, or an absolute one, the suffix in any case; ``**`` stands for any
+        folders.
 
         Raises
         ------
         InputError
-            The pattern is empty or absolute, or there are too many files.
+            The pattern names no files, or there are too many.
         """
         *above, last = pattern.split("/")
-        if not last or pattern.startswith("/"):
-            text = f"{pattern!r} is no pattern of files below a folder"
-            raise InputError("RIL-216", text, remedy="give one such as left/*.png, and the folder above as root")
+        if not last:
+            raise InputError("RIL-216", f"{pattern!r} is no pattern of files", remedy="give one such as left/*.png")
         places = [root]
+        if pattern.startswith("/"):
+            places, above = [Path("/")], above[1:]
         for part in above:
             if part == "**":
                 places = [place for top in places for place, _ in self.below(top)]
