@@ -101,7 +101,7 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
             text = f"{folder / name} does not say how it stands in the body (T_BS): it is not used"
             warnings.append(warning("RIL-683", text))
             continue
-        file, pose = f"{name}/data.csv", tuple((T_body_sensor.inverse() @ T_body_left).to_list())
+        file, pose = f"{name}/data.csv", T_body_sensor.inverse() @ T_body_left
         if name == IMU:
             imu = Imu(file=file, T_imu_left=pose)
         else:

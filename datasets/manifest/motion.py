@@ -201,10 +201,8 @@ class MotionReader:
             text = f"{table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             named = f"; of its columns ({', '.join(rows.header)}) none is called time" if rows.header else ""
             raise IncompleteError("RIL-230", text + named, remedy="give one a pair, or poses with times")
-        if section.T_body_left is None:
-            return poses
-        T_body_left = RigidTransform.from_matrix(section.T_body_left)
-        return tuple(pose and pose @ T_body_left for pose in poses)
+        mount = section.T_body_left
+        return poses if mount is None else tuple(pose and pose @ mount for pose in poses)
 
     def of_times(self, timed: TimedPoses, section: PoseFile | Attitude, table: str) -> Poses:
         """The pose at the time of each pair; None where the file has none about that time."""
@@ -217,7 +215,7 @@ class MotionReader:
         if 2 * sum(pose is not None for pose in poses) < len(poses):
             self.refuse_sparse(section, moved.times or (), table)
         if table == "truth":
-            left = np.zeros(3) if section.T_body_left is None else np.array(section.T_body_left)[3::4]
+            left = np.zeros(3) if section.T_body_left is None else section.T_body_left.translation
             track = tuple(tuple(pose.apply(left).tolist()) for pose in moved.poses if pose)
             self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
         return poses
@@ -272,8 +270,7 @@ class MotionReader:
         if section.lever_arm is not None:
             text = f"truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
-        mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        self.state(truth=self.poses(section, "truth", rows), truth_mount=mount)
+        self.state(truth=self.poses(section, "truth", rows), truth_mount=section.T_body_left)
         self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
     def odometry(self, section: Odometry) -> None:
@@ -290,9 +287,9 @@ class MotionReader:
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
         self.refuse_sparse(section, times or (), "truth")
-        mount, lever = section.T_body_left, section.lever_arm
-        if mount is not None and lever is None:  # the body's origin is the antenna
-            x, y, z = map(float, RigidTransform.from_matrix(mount).inverse().translation)
+        lever = section.lever_arm
+        if section.T_body_left is not None and lever is None:  # the body's origin is the antenna
+            x, y, z = map(float, section.T_body_left.inverse().translation)
             lever = x, y, z
         return protocol.Positions(rows, times, section.max_gap, lever)
 
@@ -365,7 +362,7 @@ class MotionReader:
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)
-        inertial = at_frames(shifted, sequence.times, RigidTransform.from_matrix(section.T_imu_left))
+        inertial = at_frames(shifted, sequence.times, section.T_imu_left)
         self.state(
             attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
             up=inertial.up if any(inertial.up) else sequence.up,

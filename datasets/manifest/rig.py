@@ -204,7 +204,7 @@ def _pinned(path: Path) -> Rig:
 
 def _stated(section: RigSection) -> RigidTransform | None:
     if section.T_right_left is not None:
-        return RigidTransform.from_matrix(section.T_right_left)
+        return section.T_right_left
     return None if section.baseline is None else parallel(section.baseline)
 
 
