@@ -284,25 +284,15 @@ def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
 
 def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[CalibratedCamera, np.ndarray]:
     """Camera of an image topic by its ``camera_info``, and the rotation from its frame to the image's."""
-    rectified = RECTIFIED.search(topic) is not None
-    entries: dict[str, Any] = {
-        "image_width": given["width"],
-        "image_height": given["height"],
-        "projection_matrix": given["p"],
-        "camera_name": topic,
-        "binning_x": given["binning_x"],
-        "binning_y": given["binning_y"],
-        "roi": {key: getattr(given["roi"], key) for key in ("x_offset", "y_offset", "width", "height")},
-    }
-    if rectified:
+    roi = {key: getattr(given["roi"], key) for key in ("x_offset", "y_offset", "width", "height")}
+    distortion_model = given["distortion_model"] or "plumb_bob"
+    entries = {**given, "roi": roi, "camera_name": topic, "distortion_model": distortion_model}
+    fields, turned = Fields(entries, f"{path} {_beside(topic)}"), np.eye(3)
+    if RECTIFIED.search(topic):
+        turned = fields.rigid("r", fields.matrix("r", 3, 3), np.zeros(3)).rotation
         # The images are rectified already: P alone is their camera, and R must not be applied again.
-        entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
-    else:
-        entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
-        entries |= {"distortion_model": given["distortion_model"] or "plumb_bob", "distortion_coefficients": given["d"]}
-    fields = Fields(entries, f"{path} {_beside(topic)}")
-    turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
-    return opencv.single(fields, path)[0], turned
+        fields.values |= {"k": fields.matrix("p", 3, 4)[:, :3], "d": [], "r": np.eye(3), "distortion_model": "none"}
+    return opencv.message(fields, path)[0], turned
 
 
 # -- motion ------------------------------------------------------------------------------------------------------------
