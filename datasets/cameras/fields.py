@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
-from rille.datasets.text.reading import GREATEST
+from rille.datasets.cameras.text import parse_nested
+from rille.datasets.text.reading import GREATEST, read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, RigidTransform
@@ -60,6 +62,11 @@ class Fields:
     def __init__(self, values: Mapping[Any, Any], file: str, at: str = "", used: set[str] | None = None) -> None:
         self.values, self.file, self.at = {str(k): v for k, v in values.items()}, file, at
         self.used = set[str]() if used is None else used
+
+    @staticmethod
+    def read(path: Path) -> Fields:
+        """Entries of a file of its own beside a calibration."""
+        return Fields(parse_nested(read_text(path, "calibration"), str(path)), str(path))
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None

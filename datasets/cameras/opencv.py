@@ -11,9 +11,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.model import CalibratedCamera
-from rille.datasets.cameras.text import parse_nested
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.reading import read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -182,10 +180,7 @@ def _beside(path: Path) -> Fields | None:
     if "intrinsic" not in path.name:
         return None
     other = path.with_name(path.name.replace("intrinsic", "extrinsic"))
-    if not other.is_file():
-        return None
-    text = read_text(other, "calibration")
-    return Fields(parse_nested(text, str(other)), str(other))
+    return Fields.read(other) if other.is_file() else None
 
 
 def _with_rectified(raw: CalibratedCamera, f: Fields, projection: str) -> CalibratedCamera:

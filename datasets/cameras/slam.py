@@ -11,8 +11,6 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
-from rille.datasets.cameras.text import parse_nested
-from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -82,7 +80,7 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
     cameras = []
     for name in sorted(key[:4] for key in f.values if re.fullmatch(r"cam\d_calib", key)):
         other = path.parent / f.text(f"{name}_calib")
-        part = Fields(parse_nested(read_text(other, "calibration"), str(other)), str(other))
+        part = Fields.read(other)
         T = f.pose(f"body_T_{name}").inverse() if f"body_T_{name}" in f else None
         cameras += [replace(camera, name=name, T_camera_reference=T) for camera in camodocal(part, other)]
         part.check_lens()
