@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from rille.datasets.cameras.model import UNKNOWN_SIZE
 from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import GREATEST, read_text
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -151,18 +152,14 @@ class Fields:
 
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
         """Camera from fx, fy, cx, cy, pixels; ``key``: of these, for errors."""
-        try:
-            fx, fy, cx, cy = map(float, values)
+        fx, fy, cx, cy = map(float, values)
+        with self._within(key):
             return Camera(fx, fy, cx, cy, *size)
-        except InputError as error:
-            raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 
     def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
         """Lens with a model of :mod:`rille.stages.geometry.lens`; ``key``: of the coefficients, for errors."""
-        try:
+        with self._within(key):
             return Lens(camera, model, coefficients)
-        except InputError as error:
-            raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
     def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
         """Lens of numbers with a key each.
@@ -234,10 +231,12 @@ class Fields:
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
         """Rigid transform of the numbers at ``key``."""
-        try:
+        with self._within(key):
             return RigidTransform(rotation, translation)
-        except InputError as error:
-            raise self.error(error.code, key, f"is no pose: {error.message}") from error
+
+    def _within(self, key: str) -> AbstractContextManager[None]:
+        """Put the file and the key in front of errors raised inside."""
+        return within(f"{self.file}: {self.at}{key}")
 
 
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
