@@ -35,7 +35,7 @@ def states(entry: str) -> Text:
 
 def has(*keys: str) -> Entries:
     """Whether one of the keys is an entry."""
-    return lambda f: any(key in f for key in keys)
+    return lambda f: f.has(*keys)
 
 
 PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,14 @@ class Fields:
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
+
+    def has(self, *keys: str) -> bool:
+        """Whether one of the keys is an entry."""
+        return any(key in self for key in keys)
+
+    def spelt(self, keys: Sequence[str]) -> str:
+        """The first of several spellings of a key that is an entry; the first of all if none is."""
+        return next((key for key in keys if key in self), keys[0])
 
     def error(self, code: str, key: str, what: str, remedy: str = CORRECT) -> InputError:
         """One line with the file and the full key."""
@@ -175,7 +183,7 @@ class Fields:
         fx, fy, cx, cy = (self.number(key) for key in keys)
         camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
         keys = coefficients.split()
-        if not any(key in self for key in keys):
+        if not self.has(*keys):
             return Lens(camera)
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)
         return self.lens(keys[0], camera, model, values[:4] if model == "radtan" and not any(values[4:]) else values)

@@ -30,6 +30,7 @@ MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectifica
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
+POSE = (*ROTATIONS, *TRANSLATIONS)
 
 
 def sides(f: Fields) -> list[tuple[str, str]]:
@@ -56,11 +57,13 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """
     lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
     poses: tuple[RigidTransform | None, RigidTransform | None]
-    placed = f if any(key in f for key in (*ROTATIONS, *TRANSLATIONS)) else _beside(path) or f
+    placed = f if f.has(*POSE) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
     else:
-        T_right_left = _relative(placed)
+        T_right_left = None
+        if placed.has(*POSE):
+            T_right_left = placed.transform(placed.spelt(ROTATIONS), placed.spelt(TRANSLATIONS))
         poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
@@ -84,7 +87,7 @@ def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def projections_alone(f: Fields) -> bool:
     """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before rectification."""
-    return "P1" in f and "P2" in f and not any(key in f for key in (*ROTATIONS, *TRANSLATIONS))
+    return "P1" in f and "P2" in f and not f.has(*POSE)
 
 
 def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -120,9 +123,7 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
 
     The pose of the latter refers to the rectified left camera: ``x_rectified = R x_camera``, and P holds the baseline.
     """
-    matrix = next(key for key in SINGLE if key in f)
-    distortion = next((key for key in DISTORTION if key in f), DISTORTION[0])
-    T = None
+    matrix, distortion, T = f.spelt(SINGLE), f.spelt(DISTORTION), None
     if "projection_matrix" in f and "rectification_matrix" in f:
         T = _unrectified(f, "rectification_matrix", "projection_matrix")
     name = f.text("camera_name", path.stem)
@@ -162,17 +163,7 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
     for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
             return f.pair_of_pixels(key)
-    width = next((key for key in WIDTHS if key in f), WIDTHS[0])
-    height = next((key for key in HEIGHTS if key in f), HEIGHTS[0])
-    return f.size(width, height)
-
-
-def _relative(f: Fields) -> RigidTransform | None:
-    rotation = next((key for key in ROTATIONS if key in f), None)
-    translation = next((key for key in TRANSLATIONS if key in f), None)
-    if rotation is None and translation is None:
-        return None
-    return f.transform(rotation or ROTATIONS[0], translation or TRANSLATIONS[0])
+    return f.size(f.spelt(WIDTHS), f.spelt(HEIGHTS))
 
 
 def _beside(path: Path) -> Fields | None:

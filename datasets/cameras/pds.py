@@ -30,8 +30,7 @@ COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(
 TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
 UNIT = re.compile(r"<[^<>]{0,40}>")
 
-COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
-"""Fewest components of each model."""
+MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
 
 def attached(path: Path) -> str:
@@ -52,7 +51,7 @@ def attached(path: Path) -> str:
 
 def is_label(text: str) -> bool:
     """Whether this is the text of a label with a camera."""
-    return GROUP.search(text) is not None or PROPERTY.search(text) is not None
+    return bool(_model(text))
 
 
 def label(text: str, path: Path) -> list[CalibratedCamera]:
@@ -62,8 +61,8 @@ def label(text: str, path: Path) -> list[CalibratedCamera]:
     """
     f = _entries(text, path)
     kind = f.text("MODEL_TYPE")
-    if kind not in COUNTS:
-        raise f.error("RIL-952", "MODEL_TYPE", f"= {kind} is not read", f"{', '.join(COUNTS)} are")
+    if kind not in MODELS:
+        raise f.error("RIL-952", "MODEL_TYPE", f"= {kind} is not read", f"{', '.join(MODELS)} are")
     camera, axes, skew = _pinhole(f)
     T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ f.numbers("MODEL_COMPONENT_1", 3))
     axis, linearity = axes[2], 1.0
@@ -99,14 +98,17 @@ def _pinhole(f: Fields) -> tuple[Camera, Floats, float]:
     return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE), np.array([x, y, a]), skew
 
 
+def _model(text: str) -> str:
+    """Text of the first camera model of a label; empty if it has none."""
+    for opens, closes in ((GROUP, GROUP_END), (PROPERTY, PROPERTY_END)):
+        if begin := opens.search(text):
+            return closes.split(text[begin.end() :], maxsplit=1)[0]
+    return ""
+
+
 def _entries(text: str, path: Path) -> Fields:
     """The first camera model of a label: its type and components."""
-    begin, close = GROUP.search(text), GROUP_END
-    if begin is None:
-        begin, close = PROPERTY.search(text), PROPERTY_END
-    assert begin is not None
-    end = close.search(text, begin.end())
-    part = UNIT.sub(" ", text[begin.end() : end.start() if end else len(text)])
+    part = UNIT.sub(" ", _model(text))
     values: dict[str, object] = {}
     for number, value in COMPONENT.findall(part):
         words = value.strip("()").replace(",", " ").split()
