@@ -154,10 +154,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "; ".join([*hints(name_or_path), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
-    remedy = (
-        f"`rille init {shlex.quote(str(name_or_path))}` writes a manifest; `rille datasets list` names what opens"
-        " without one"
-    )
+    remedy = f"`rille init {shlex.quote(name_or_path)}` writes a manifest; `rille datasets list` names what opens "
+    remedy += "without one"
     if beside.is_file():
         remedy = f"give its manifest, {beside}"
     elif bags := [entry.path for entry in Search().entries(path) if is_bag(Path(entry.path))]:

@@ -49,8 +49,8 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
             raise f.error("RIL-108", "model", f"{model} is not read", f"one of {', '.join(MODELS)}")
         names, lens = MODELS[model][0].split(), MODELS[model][1]
         if len(values) != len(names):
-            text = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
-            raise f.error("RIL-109", "parameters", text)
+            count = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
+            raise f.error("RIL-109", "parameters", count)
         zeros = dict.fromkeys(COEFFICIENTS[lens].split(), "0")
         stated = dict(zip(names, values, strict=True)) | {"width": width, "height": height}
         f = Fields(zeros | stated, str(path), f.at)

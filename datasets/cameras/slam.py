@@ -120,9 +120,8 @@ def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:
 def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     kind = f.text("camera_model", "pinhole")
     if kind.lower() != "pinhole":
-        raise f.error(
-            "RIL-135", "camera_model", f"= {kind!r} is not read", "calibrate as pinhole with radtan or equidistant"
-        )
+        remedy = "calibrate as pinhole with radtan or equidistant"
+        raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
     fx, fy, cx, cy = f.numbers("intrinsics", 4)
     camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution"))
     coefficients = f.numbers(distortion) if distortion in f else ()

@@ -42,11 +42,8 @@ def parse_corners(text: str) -> tuple[int, int]:
     """
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal() and min(int(columns), int(rows)) >= LEAST_SIDE):
-        raise ConfigError(
-            "RIL-151",
-            f"--corners {text!r} is not COLUMNSxROWS",
-            remedy=f"give inner corners, e.g. 9x6 for a board of 10 x 7 squares; at least {LEAST_SIDE} each",
-        )
+        remedy = f"give inner corners, e.g. 9x6 for a board of 10 x 7 squares; at least {LEAST_SIDE} each"
+        raise ConfigError("RIL-151", f"--corners {text!r} is not COLUMNSxROWS", remedy=remedy)
     return int(columns), int(rows)
 
 

@@ -63,11 +63,9 @@ def examined(sequence: Sequence) -> Sequence:
     for camera, share in [(camera, fixed_pattern(of)) for camera, of in images.items() if camera not in mosaics]:
         # 0.2: moving scenes have at most 0.03, with a pattern of 8 grey levels in 256 0.25, of 25 levels 0.7.
         if share > 0.2:
-            text = (
-                f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract "
-                "a dark frame, the mean of images that are taken with the lens covered"
-            )
-            lines.append(warning("RIL-833", text))
+            text = f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise)"
+            remedy = "subtract a dark frame, the mean of images that are taken with the lens covered"
+            lines.append(warning("RIL-833", f"{text}: {remedy}"))
     chosen_levels = levels.levels_of_sides(*images.values())
     if not any(chosen_levels):
         return replace(sequence, warnings=(*sequence.warnings, *lines))

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
 from rille.datasets.georeference import Georeference, are_degrees, metric_crs
+from rille.datasets.protocol import Vector
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.validation import TAG, validated
 from rille.stages.core.declare import Params
@@ -33,7 +34,7 @@ def _pose(value: Any) -> RigidTransform:
 Pose = Annotated[RigidTransform, PlainValidator(_pose)]
 
 
-def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _direction(value: Vector) -> Vector:
     """A unit vector."""
     length = math.hypot(*value)
     if not length > 0:
@@ -41,7 +42,6 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value[0] / length, value[1] / length, value[2] / length
 
 
-Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_direction)]
 PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv", "colmap"]
 Columns = dict[Literal["time", "x", "y", "z"], str | int]

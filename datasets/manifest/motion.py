@@ -289,8 +289,7 @@ class MotionReader:
         self.refuse_sparse(section, times or (), "truth")
         lever = section.lever_arm
         if section.T_body_left is not None and lever is None:  # the body's origin is the antenna
-            x, y, z = map(float, section.T_body_left.inverse().translation)
-            lever = x, y, z
+            lever = protocol.vector_of(section.T_body_left.inverse().translation)
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
