@@ -53,9 +53,6 @@ INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_
 FRAMES = "/tf_static"
 
 
-Reckoned = tuple[RigidTransform | None, ...] | None
-
-
 @dataclass(frozen=True)
 class TakenImage:
     """One image message: time of its recording, its digest, width, height and bits of its image, and the frame of its
@@ -300,7 +297,7 @@ def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[Calibrate
 
 def _movement(
     reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: Floats
-) -> tuple[Inertial, Reckoned, list[str]]:
+) -> tuple[Inertial, tuple[RigidTransform | None, ...] | None, list[str]]:
     """Records of IMU and odometry at each frame, and warnings about unusable ones."""
     frames, warnings = _static(reader), list[str]()
     inertial, odometry = Inertial(), None

@@ -188,6 +188,15 @@ class Fields:
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)
         return self.lens(keys[0], camera, model, values[:4] if model == "radtan" and not any(values[4:]) else values)
 
+    def distorted(self, key: str, camera: Camera) -> Lens:
+        """Lens with the coefficients listed at ``key``, if any, and the model that another key may name."""
+        model, coefficients = by_count(self.numbers(key) if key in self else ())
+        stated = self.model(key)
+        # ROS writes five zeros for cameras without distortion, whatever the model.
+        if stated == "fisheye" or (stated and any(coefficients)):
+            model = stated
+        return self.lens(key, camera, model, coefficients)
+
     def model(self, coefficients: str) -> str:
         """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty if none does.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.arrays import Floats
@@ -55,7 +55,8 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     R, T and P1, P2 may be in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files
     with LEFT.R and RIGHT.P (rectification, as in ORB-SLAM2) are read too.
     """
-    lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
+    keys = enumerate(sides(f), start=1)
+    lenses = [f.distorted(distortion, f.pinhole(matrix, _size(f, str(k)))) for k, (matrix, distortion) in keys]
     poses: tuple[RigidTransform | None, RigidTransform | None]
     placed = f if f.has(*POSE) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
@@ -127,7 +128,8 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
     if "projection_matrix" in f and "rectification_matrix" in f:
         T = _unrectified(f, "rectification_matrix", "projection_matrix")
     name = f.text("camera_name", path.stem)
-    whole = _with_rectified(CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T), f, "projection_matrix")
+    lens = f.distorted(distortion, f.pinhole(matrix, _size(f)))
+    whole = _with_rectified(CalibratedCamera(name, lens, T), f, "projection_matrix")
     rectified = whole.rectified and replace(whole.rectified, lens=_read_out(f, whole.rectified.lens))
     return [replace(whole, lens=_read_out(f, whole.lens), rectified=rectified)]
 
@@ -145,17 +147,6 @@ def _read_out(f: Fields, lens: Lens) -> Lens:
     # The centre of a combined pixel lies in the middle of those that it combines.
     centre = (whole.cx - left) / x + (0.5 / x - 0.5), (whole.cy - top) / y + (0.5 / y - 0.5)
     return replace(lens, camera=f.camera("roi", (whole.fx / x, whole.fy / y, *centre), size))
-
-
-def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Lens:
-    camera = f.pinhole(matrix, size)
-    coefficients = f.numbers(distortion) if distortion in f else ()
-    model, coefficients = by_count(coefficients)
-    stated = f.model(distortion)
-    # ROS writes five zeros for cameras without distortion, whatever the model.
-    if stated == "fisheye" or (stated and any(coefficients)):
-        model = stated
-    return f.lens(distortion, camera, model, coefficients)
 
 
 def _size(f: Fields, side: str = "") -> tuple[int, int]:

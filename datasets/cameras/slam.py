@@ -123,10 +123,7 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
         remedy = "calibrate as pinhole with radtan or equidistant"
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
     fx, fy, cx, cy = f.numbers("intrinsics", 4)
-    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution"))
-    coefficients = f.numbers(distortion) if distortion in f else ()
-    model = f.model(distortion) or ("radtan" if coefficients else "none")
-    return f.lens(distortion, camera, model, () if model == "none" and not any(coefficients) else coefficients)
+    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution")))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

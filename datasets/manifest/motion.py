@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rille.datasets import protocol
+from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
@@ -231,7 +232,7 @@ class MotionReader:
         if any(t != int(t) for t in times) or section.max_gap >= 1 or 2 * np.count_nonzero(there) >= len(self.pairs):
             return None
         known = dict(zip(map(int, times), timed.poses, strict=True))
-        numbers = [int(["-1", *re.findall(r"\d+", pair.left.stem)][-1]) for pair in self.pairs]
+        numbers = [last_number(pair.left) for pair in self.pairs]
         poses = tuple(map(known.get, numbers))
         if 2 * sum(pose is not None for pose in poses) < len(poses) or len(set(numbers)) < len(numbers):
             return None

@@ -204,17 +204,17 @@ def _stated(section: RigSection) -> RigidTransform | None:
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:
     """Refuse a length (m) that looks like one in another unit, or warn about it, unless the unit is stated."""
+    if baseline <= USUAL_BASELINE or "unit" in section.model_fields_set:
+        return []
     from_files = section.baseline is None and section.T_right_left is None
-    if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
+    if baseline > LONGEST_BASELINE:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"
         remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
         raise InputError("RIL-244", text, remedy=remedy)
-    if baseline > USUAL_BASELINE and from_files and "unit" not in section.model_fields_set:
-        doubt = "is the calibration's unit the metre, not a centimetre or a square of the chessboard?"
-        remedy = "A manifest's rig.unit states its length in metres, 1 keeps it"
-        return [warning("RIL-716", f"the baseline is {baseline:g} m: {doubt} {remedy}")]
-    return []
+    doubt = "is the calibration's unit the metre, not a centimetre or a square of the chessboard?"
+    remedy = "A manifest's rig.unit states its length in metres, 1 keeps it"
+    return [warning("RIL-716", f"the baseline is {baseline:g} m: {doubt} {remedy}")] if from_files else []
 
 
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
