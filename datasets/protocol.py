@@ -124,10 +124,6 @@ class Simulation:
     ground: tuple[float, float, float, float]
     overview: Source | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON form of the rover's own data (the sources have their own keys)."""
-        return {"T_vehicle_left": self.T_vehicle_left.to_list(), "pad": self.pad}
-
 
 @dataclass(frozen=True)
 class Sequence:

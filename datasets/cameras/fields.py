@@ -142,9 +142,10 @@ class Fields:
 
     def pose(self, key: str) -> RigidTransform:
         """Rigid transform from a 4 x 4 or 3 x 4 matrix."""
-        if len(self.numbers(key)) not in (12, 16):
-            raise self.error("RIL-117", key, f"has {len(self.numbers(key))} numbers, it takes a 4 x 4 matrix")
-        m = np.array(self.numbers(key)).reshape(-1, 4)
+        numbers = self.numbers(key)
+        if len(numbers) not in (12, 16):
+            raise self.error("RIL-117", key, f"has {len(numbers)} numbers, it takes a 4 x 4 matrix")
+        m = np.array(numbers).reshape(-1, 4)
         if len(m) == 4 and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
             raise self.error("RIL-118", key, f"has the last row {m[3].tolist()}, it should be 0 0 0 1")
         return self.rigid(key, m[:3, :3], m[:3, 3])
@@ -305,11 +306,8 @@ def _flat(value: Any) -> list[Any] | None:
         return list(value.reshape(-1).tolist())
     if not isinstance(value, list | tuple):
         return None
-    flat: list[Any] = []
-    for one in value:
-        part = _flat(one) if isinstance(one, list | tuple) else [one]
-        flat += part or []
-    return flat
+    parts = (_flat(one) if isinstance(one, list | tuple) else [one] for one in value)
+    return [one for part in parts for one in part or []]
 
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
