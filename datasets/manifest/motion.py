@@ -139,7 +139,7 @@ class MotionReader:
         lines = read_lines(path, "times")
         if self.growing and not path.read_bytes().endswith(b"\n"):  # the last line is still being written
             del lines[-1:]
-        header, found, at = tuple[str, ...](), list[list[str]](), list[int]()
+        header, found = tuple[str, ...](), list[tuple[list[str], int]]()
         images, by_name = False, dict[str, int]()
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
@@ -151,16 +151,16 @@ class MotionReader:
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
             stated = [cell for title, cell in titles.items() if TIME.search(title)]
-            found.append([cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]])
-            at.append(k)
             images = images or bool(names)
-            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(at) - 1 for cell in names or cells[1:2]}
-        if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells in found):
-            found = [[of_two(*cells)] for cells in found]
+            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(found) for cell in names or cells[1:2]}
+            times = [cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]]
+            found.append((times, k))
+        if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells, _ in found):
+            found = [([of_two(*cells)], k) for cells, k in found]
         units = [unit_of(title) for title in header if TIME.search(title)]
         unit = next((stated for stated in units if stated in UNITS), "auto")
-        column = int(_counts(found))
-        rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
+        column = int(_counts([cells for cells, _ in found]))
+        rows = [(cells[column], k) for cells, k in found]
         # Tables may list more images than there are pairs, in any order: if all pairs are found, names decide.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
