@@ -261,10 +261,9 @@ def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
     """Model that OpenCV uses for a number of coefficients, and the coefficients without trailing zeros."""
     k = coefficients
     # OpenCV writes all coefficients of its largest model, with zeros for the terms that were not estimated.
-    if len(k) == 14 and not any(k[12:]):
-        k = k[:12]
-    if len(k) == 12 and not any(k[8:]):
-        k = k[:8]
+    for count, fewer in ((14, 12), (12, 8)):
+        if len(k) == count and not any(k[fewer:]):
+            k = k[:fewer]
     if not k:
         return "none", k
     return ("radtan", k) if len(k) <= 5 else ("rational", k)

@@ -57,15 +57,13 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     """
     keys = enumerate(sides(f), start=1)
     lenses = [f.distorted(distortion, f.pinhole(matrix, _size(f, str(k)))) for k, (matrix, distortion) in keys]
-    poses: tuple[RigidTransform | None, RigidTransform | None]
+    poses: tuple[RigidTransform | None, RigidTransform | None] = None, None
     placed = f if f.has(*POSE) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
-    else:
-        T_right_left = None
-        if placed.has(*POSE):
-            T_right_left = placed.transform(placed.spelt(ROTATIONS), placed.spelt(TRANSLATIONS))
-        poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
+    elif placed.has(*POSE):
+        T_right_left = placed.transform(placed.spelt(ROTATIONS), placed.spelt(TRANSLATIONS))
+        poses = RigidTransform.identity(), T_right_left
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
     return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
