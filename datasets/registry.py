@@ -141,7 +141,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # The user's manifest overrides the layout.
-    manifest = folder_manifest(path) if number is None and name_or_path and path.is_dir() else None
+    manifest = folder_manifest(path) if number is None and path.is_dir() else None
     if manifest is not None:
         return open_manifest(manifest, digests)
     for module in layouts():
