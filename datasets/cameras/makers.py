@@ -131,11 +131,8 @@ def numbers_of_matrix(text: str) -> list[str]:
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     """Two equal parallel cameras of ``K.txt`` with K row by row and a baseline in metres; one camera if that lacks."""
     fx, _, cx, _, fy, cy, _, _, _, *baseline = numbers_of_matrix(text)
-    f = Fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}, str(path))
-    lens = f.optics("fx fy cx cy", "none", "", UNKNOWN_SIZE)
-    if "baseline" not in f:
-        return [CalibratedCamera(path.stem, lens)]
-    return stereo_cameras(lens, lens, parallel(f.number("baseline")))
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}
+    return figures(Fields(values, str(path)), path)
 
 
 def _parts(f: Fields) -> list[Fields]:
