@@ -103,7 +103,8 @@ def orient_rig(
             # Matches that are off by a period may contradict a right calibration, or lie beyond infinity.
             facts["repeats"] = (
                 f"{repeated:.0%} of the matches look as well elsewhere on their epipolar lines: on a pattern that "
-                "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses"
+                "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses, "
+                "which no standard deviation contains"
             )
             facts["warnings"].insert(0, facts["repeats"])
         if len(usable) < len(pairs):
