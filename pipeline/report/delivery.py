@@ -125,11 +125,15 @@ def _delivered(view: RunView, frames: Rows, pairs: Rows) -> list[str]:
     return words
 
 
+CONTRADICTIONS = ("repeats", "contradiction", "knocked", "misread")
+"""Facts that say what the images contradict."""
+
+
 def contradictions(view: RunView) -> list[str]:
     """List what the images contradict so that no figure may rest on it, one line each."""
     p = view.products
     facts = [facts_of(view, handle) for handle in (*p.contradictions, *p.rigs.values(), *p.resections)]
-    return list(dict.fromkeys(f[key] for f in facts for key in ("repeats", "contradiction", "knocked") if key in f))
+    return list(dict.fromkeys(f[key] for f in facts for key in CONTRADICTIONS if key in f))
 
 
 def _failures(view: RunView) -> Items:

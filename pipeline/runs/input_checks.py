@@ -24,7 +24,7 @@ from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.rigid import angles_between, lengths_along
 from rille.stages.geometry.scale import MAX_ALIKE_SCALE
-from rille.stages.imaging.image_quality import grey_rows
+from rille.stages.imaging.image_quality import faint, grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 from rille.stages.terrain.reference import camera_height
 
@@ -100,6 +100,7 @@ LIMITS = {
         InputLimit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
         # The matcher removes the mean, but not the noise.
         InputLimit("RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix exposure"),
+        InputLimit("RIL-755", "faint", most=0),
         InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and depth"),
     ),
     "sharpness": (
@@ -332,8 +333,9 @@ def judge_looks(
     judged = {bad.subject for bad in out}
     both = [k for k in opened.get("left", {}) if k in opened.get("right", {})]
     if both:
-        lines = grey_rows({camera: [of[k] for k in both] for camera, of in opened.items()})
-        out += [judge("images", line, {"grey": 1}) for line in lines]
+        whole = {camera: [of[k] for k in both] for camera, of in opened.items()}
+        out += [judge("images", line, {"grey": 1}) for line in grey_rows(whole)]
+        out += [judge("exposure", line, {"faint": 1}) for line in faint(whole)]
     if both and "exposure" not in judged:
         left, right = (_figure({k: opened[camera][k] for k in both}, "mean") for camera in ("left", "right"))
         # At least one grey level, because the ratio of two black images means nothing.

@@ -1,23 +1,29 @@
-"""Whether matches fit the rig better with another reading of the lens coefficients, or of R between the cameras.
+"""Whether matches fit the rig better with another reading of the lens coefficients, of R between the cameras, or with
+another focal length of one camera.
 
 Programs write the same numbers in different orders, and under the names of different models. A wrong reading bends
 the epipolar lines by pixels, which no rotation of a camera explains. MATLAB's rotations are transposed, since they
-multiply row vectors.
+multiply row vectors. A focal length of one camera alone that is off stretches its rows against those of the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from rille.stages.calibration.relative_orientation import RIG, PointPairs
+from rille.stages.core.arrays import Floats
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 
 TRANSPOSED = "it is transposed"
+EXCHANGED = "those of left and right are exchanged"
+MAX_RATIO = 1.25
+"""Ratio of a focal length to the given one up to which it is searched for; beyond it images hardly match."""
 
 
 def readings(lens: Lens) -> dict[str, Lens]:
@@ -34,21 +40,31 @@ def readings(lens: Lens) -> dict[str, Lens]:
     return found
 
 
-def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPairs]) -> str:
+def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPairs]) -> str:
     """Message on another reading of the calibration that brings the matches to their epipolar lines; empty: none does.
 
     Parameters
     ----------
+    repaired : the rig as turned by the matches; where it fits them no focal length is doubted.
     lenses : of the left and the right camera; with them the images were undistorted to those of the ``rig``.
     pairs : matches in ideal images.
     """
     ideal = {"left": rig.left, "right": rig.right}
     points = {side: np.concatenate([getattr(m, side) for m in pairs]) for side in ideal}
 
-    def off(by: Mapping[str, Lens], rig: Rig = rig) -> float:
-        """Median distance, pixels, of the matches from their lines, their raw pixels undistorted by these lenses."""
+    def apart(by: Mapping[str, Lens], rig: Rig = rig) -> Floats:
+        """Distances, pixels, of the matches from their lines, their raw pixels undistorted by these lenses."""
         at = {s: by[s].undistort(lenses[s].distort(points[s], ideal[s]), ideal[s]) for s in ideal}
-        return float(np.nanmedian(np.abs(distances(rig, np.zeros(RIG), *at.values())[0])))
+        return distances(rig, np.zeros(RIG), *at.values())[0]
+
+    def off(by: Mapping[str, Lens], rig: Rig = rig) -> float:
+        """Median distance, pixels."""
+        return float(np.nanmedian(np.abs(apart(by, rig))))
+
+    def spread(ratio: float) -> float:
+        """The same about the median, which a turn changes, with a right focal length ``ratio`` times as long."""
+        found = apart({**lenses, "right": _longer(lenses["right"], ratio)})
+        return float(np.nanmedian(np.abs(found - np.nanmedian(found))))
 
     given = off(lenses)
     # 0.3 px: a good calibration leaves less.
@@ -59,12 +75,32 @@ def better_reading(rig: Rig, lenses: Mapping[str, Lens], pairs: Sequence[PointPa
     both = {name: off({s: other[s].get(name, lenses[s]) for s in ideal}) for name in names}
     between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
     both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
+    both[EXCHANGED] = off({"left": lenses["right"], "right": lenses["left"]})
+    ratio, fitted = _least(spread)
+    focal = f"the right camera's is {ratio:.3f} times as given, or the left one's {1 / ratio:.3f} times"
+    if fitted <= 0.5 * min(spread(1.0), off(lenses, repaired)):
+        both[focal] = fitted
     name, least = min(both.items(), key=lambda item: item[1])
     # Half of it: by chance no reading is so much better.
     if least > min(0.5 * given, 0.3):
         return ""
-    what = "R between the cameras seems" if name == TRANSPOSED else "the coefficients of the lenses seem"
+    subjects = {
+        TRANSPOSED: "R between the cameras seems",
+        EXCHANGED: "the figures of the two cameras seem",
+        focal: "a focal length seems",
+    }
     return (
-        f"{what} misread: the matches lie "
+        f"{subjects.get(name, 'the coefficients of the lenses seem')} misread: the matches lie "
         f"{given:.2f} px off their epipolar lines (median) as given, {least:.2f} px if {name}"
     )
+
+
+def _longer(lens: Lens, ratio: float) -> Lens:
+    """The lens with a focal length that is ``ratio`` times as long."""
+    return replace(lens, camera=replace(lens.camera, fx=lens.camera.fx * ratio, fy=lens.camera.fy * ratio))
+
+
+def _least(spread: Callable[[float], float]) -> tuple[float, float]:
+    """Ratio of a focal length to the given one at which a spread is least, and that spread."""
+    found = minimize_scalar(spread, bounds=(1.0 / MAX_RATIO, MAX_RATIO), method="bounded", options={"xatol": 1e-4})
+    return float(found.x), float(found.fun)

@@ -40,6 +40,7 @@ from rille.stages.calibration.relative_orientation import (
 )
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
+from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import OrientationFacts, RigFacts
 from rille.stages.geometry.epipolar import (
     MAX_IMAGE_TURN_DEG,
@@ -53,7 +54,7 @@ from rille.stages.geometry.epipolar import (
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
-from rille.stages.geometry.sides import refuse_impossible, refuse_mirrored
+from rille.stages.geometry.sides import BeyondInfinityError, refuse_impossible, refuse_mirrored
 from rille.stages.numeric.robust import mad_sigma
 
 
@@ -102,7 +103,8 @@ def orient_rig(
             # Matches that are off by a period may contradict a right calibration, or lie beyond infinity.
             facts["repeats"] = (
                 f"{repeated:.0%} of the matches look as well elsewhere on their epipolar lines: on a pattern that "
-                "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses"
+                "repeats (rows of plants, bricks, tiles) they may be off by a period, and with them depths and poses, "
+                "which no standard deviation contains"
             )
             facts["warnings"].insert(0, facts["repeats"])
         if len(usable) < len(pairs):
@@ -358,10 +360,21 @@ def rig_stage(
         for found in orientations
     ]
     shares = [found.meta["repeated"] for found in orientations]
-    facts = orient_rig(rig, pairs, params, first, float(np.mean(shares)) if shares else 0.0)
     opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
     both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened
-    if "matches" in facts and (misread := better_reading(rig, both, pairs)):
+    try:
+        facts = orient_rig(rig, pairs, params, first, float(np.mean(shares)) if shares else 0.0)
+    except BeyondInfinityError as refusal:
+        if not (misread := better_reading(rig, rig, both, pairs)):
+            raise
+        text = f"the calibration contradicts the images: {misread}"
+        raise DegenerateError("RIL-752", text, remedy="correct the calibration") from refusal
+    if "matches" in facts and (misread := better_reading(rig, Rig.from_dict(facts["rig"]), both, pairs)):
         facts["misread"] = misread
+        # A turn that no mount makes, or from pair to pair, is the misreading's.
+        facts.pop("knocked", None)
+        if (turned := facts.get("contradiction")) is not None:
+            facts["contradiction"] = misread
+            facts["warnings"].remove(turned)
         facts["warnings"].insert(0, misread)
     return Bundle({}, facts)

@@ -14,7 +14,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
-from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.epipolar import distances, standing
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
@@ -24,14 +24,22 @@ MIN_SPREAD_PX = 1.0
 
 
 def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
-    """Distances [px] of the matches from their epipolar lines, less their median; None for too few matches.
+    """Distances [px] of the matches from their epipolar lines, less their median and trend; None for too few matches.
 
-    The median is due to a small turn of a camera, not to a shift in time.
+    The median is due to a small turn of a camera, the trend across the lines to focal lengths that do not fit each
+    other. Neither is due to a shift in time.
     """
-    apart, _ = distances(rig, np.zeros(5), *matched_points(left, right))
+    at, other = matched_points(left, right)
+    apart, _ = distances(rig, np.zeros(5), at, other)
     # Far mismatches (a tenth of the image) would hide the effect of a shift on the others.
-    apart = apart[np.abs(apart) < 0.1 * rig.right.height]
-    return np.asarray(apart - np.median(apart)) if len(apart) >= 40 else None
+    near = np.abs(apart) < 0.1 * rig.right.height
+    if near.sum() < 40:
+        return None
+    apart, across = apart[near], at[near, 0 if standing(rig) else 1]
+    apart, across = apart - np.median(apart), across - np.median(across)
+    far = np.abs(across) >= max(1.0, float(np.median(np.abs(across))))
+    trend = np.median(apart[far] / across[far]) if far.any() else 0.0
+    return np.asarray(apart - trend * across)
 
 
 def best_partners(offsets: Mapping[int, Mapping[int, Floats | None]]) -> SynchronyFacts:

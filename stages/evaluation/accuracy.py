@@ -225,7 +225,7 @@ def accuracy_stage(
     arrays, figures = trajectory_accuracy(estimate, true, claimed, *source.sigmas)
     facts: AccuracyFacts = {"metrics": figures, "frames": frames}
     both = posed(estimate) & posed(true)
-    if claimed is not None and both.any():
+    if claimed is not None and both.sum() > 1:
         stated = math.sqrt(np.nanmean(np.trace(claimed[both, :3, :3], axis1=1, axis2=2)))
         off = hand_eye(estimate, true)
         mounted = None if off is None else rigid.compose(true[both], off)

@@ -16,6 +16,10 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import right_pixels
 
 
+class BeyondInfinityError(DegenerateError):
+    """Most matches lie beyond infinity, though the sides are not exchanged."""
+
+
 def fits(rig: Rig, left: Floats, right: Floats, tolerance: float = MAX_LINE_DISTANCE_PX) -> float:
     """Share of the matches (n, 2), (n, 2) in front of the cameras and within ``tolerance``, pixels of the coarser
     image, of their epipolar lines."""
@@ -70,7 +74,7 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
             "mirrored or upside down, and whether the scene repeats along the rows (bricks, tiles)",
         )
     if beyond > 0.5:
-        raise DegenerateError(
+        raise BeyondInfinityError(
             "RIL-375",
             f"{beyond:.0%} of the matches lie beyond infinity",
             remedy="check that left and right are of one scene and one time, the angles between the cameras (is R "

@@ -17,6 +17,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import asdict, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,12 +28,44 @@ from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, levelled, ratio_of_matches
 from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import Shape, as_matched
+from rille.stages.hfvm.image import Shape, as_matched, thinned
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
 from rille.stages.imaging.pyramid import Pyramid
+
+MIN_BORNE_OUT = 0.1
+"""Share of the known pixels of a map that the images bear out, below which it is read otherwise; of a map of the
+matcher's quality it is 0.8."""
+
+FACTORS = (-1.0, 0.5, 2.0, 1.0 / 16, 16.0, 1.0 / 256, 256.0)
+"""Factors of the values of wrong maps: the sign, images of another size, counts of SGBM, counts of KITTI's PNG."""
+
+
+def otherwise(left: AnyArray, right: AnyArray, column: AnyArray) -> str:
+    """How given column displacements (row, col) fit two grey images that they do not fit as they are; empty: no way."""
+    readings = {f"their values times {factor:g}": column * np.float32(factor) for factor in FACTORS}
+    readings["their rows in reverse"] = column[::-1]
+    differences = {name: _difference(left, right, u) for name, u in readings.items()}
+    name, least = min(differences.items(), key=lambda item: item[1])
+    # Half of it: by chance no reading is so much better.
+    return name if least < 0.5 * _difference(left, right, column) else ""
+
+
+def _difference(left: AnyArray, right: AnyArray, column: AnyArray) -> float:
+    """Median difference, grey values, of the right image's pixels at the ends of displacements from the left ones."""
+    # At most as many as cv2.remap takes in a row.
+    y, x = thinned(np.isfinite(column), 10_000)
+    if not len(y):
+        return 255.0
+    end = x + column[y, x]
+    inside = (end >= 0) & (end <= right.shape[1] - 1)
+    # Values that lead out of most of the image are of another unit.
+    if inside.mean() < 0.5:
+        return 255.0
+    there = cv2.remap(right, end[None].astype(np.float32), y[None].astype(np.float32), cv2.INTER_LINEAR)[0]
+    return float(np.median(np.abs(there - left[y, x])[inside]))
 
 
 def check(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams) -> dict[str, AnyArray]:
@@ -114,4 +147,12 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
         # Where a map of it says nothing the estimate stays.
         stated = matched(arrays["validity"]) & (given["disparity_std"] > 0)
         arrays["disparity_std"] = np.where(stated, given["disparity_std"], arrays["disparity_std"])
-    return Bundle(arrays, facts(arrays, params, ImageDifference(), int(np.count_nonzero(a.valid[0]))))
+    said = facts(arrays, params, ImageDifference(), int(np.count_nonzero(a.valid[0])))
+    column = np.asarray(given["column_disparity"])
+    if np.mean(matched(arrays["validity"])) < MIN_BORNE_OUT * np.mean(np.isfinite(column)):
+        fit = otherwise(a.images[0], b.images[0], column)
+        how = (
+            f"they fit with {fit}: correct them, or [disparity]" if fit else "are they of these left images, in pixels?"
+        )
+        said["warnings"] = [f"the maps of [disparity] contradict the images: {how}"]
+    return Bundle(arrays, said)

@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, grey_rows
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -242,9 +242,11 @@ def frame_screening_stage(
     if found.late:
         meta["late"] = sorted(found.late)
     if not any(found.asks.values()):
+        sound = {side: [seen[f][side] for f in frames if f not in found.lost] for side in SIDES}
         meta["warnings"] = [
             *(f"frame {b} repeats the left image of frame {a}: no motion between them" for a, b in found.repeated),
             *(f"frame {f} is not used as basic pair: {unfit[f]}" for f in chain if f in unfit),
-            *grey_rows({side: [seen[f][side] for f in frames if f not in found.lost] for side in SIDES}),
+            *grey_rows(sound),
+            *faint(sound),
         ]
     return Bundle({}, meta)

@@ -169,7 +169,9 @@ class Inspection:
 
     def _sides(self, whole: list[int]) -> Generator[Wait, Any, int]:
         """Whether left and right of some pairs fit each other; the first of these pairs that does."""
-        tests = {pair: self.make.swap_check(pair) for pair in spread(whole, 6)}
+        # With neighbours, since a recorder may exchange the sides of every other pair.
+        chosen = sorted({pair for step in spread(list(pairwise(whole)), 3) for pair in step}) or whole
+        tests = {pair: self.make.swap_check(pair) for pair in chosen}
         yield Maybe(list(tests.values()))
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)

@@ -112,7 +112,10 @@ def _ambiguity(
         if body
         else "leave out frames in which the camera stood, or mask what moves with it or repeats along the way (a fence)"
         if stays
-        else "mask what moves by itself, or what repeats along the way (sleepers, tiles)",
+        else (
+            "mask what moves by itself, or what repeats along the way (sleepers, tiles); if both are nearly alike, "
+            "rows may not be of one time (a rolling shutter on a mount that vibrates)"
+        ),
     )
 
 

@@ -50,8 +50,9 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
         return
     raise DegenerateError(
         "RIL-771",
-        f"frame {frame}: the focal length changed by some {100.0 * larger:+.2g} %, by zoom or focus: {agree} of "
-        f"{count} landmarks agree with one pose then, {agreeing} as calibrated",
+        f"frame {frame}: the focal length changed by some {100.0 * larger:+.2g} %, by zoom or focus (or, if all frames "
+        f"say so, a principal point's column is wrong, or one image cut): {agree} of {count} landmarks agree with one "
+        f"pose then, {agreeing} as calibrated",
         remedy="keep zoom and focus as they were calibrated; what was taken with others is a sequence of its own, with "
         "its own calibration",
     )

@@ -115,6 +115,17 @@ def test_a_first_pair_whose_sides_are_exchanged_is_named_and_another_is_matched(
     assert "median 4 m" in line(lines, "matching")
 
 
+def test_sides_that_are_exchanged_in_every_other_pair_are_named(tmp_path, capsys):
+    path = folder(tmp_path / "wall", frames=8)
+    for k in range(1, 8, 2):
+        left, right = path / "left" / f"{k:03d}.png", path / "right" / f"{k:03d}.png"
+        left.rename(path / "old.png")
+        right.rename(left)
+        (path / "old.png").rename(right)
+    _, lines = run(path, capsys)
+    assert "first frame 001: left and right are swapped" in line(lines, "sides")
+
+
 @pytest.mark.parametrize(("side", "axis"), [("left", 1), ("right", 0)])
 def test_one_camera_that_is_mirrored_fails(tmp_path, capsys, side, axis):
     path = folder(tmp_path / "wall", frames=1)

@@ -177,6 +177,12 @@ def test_good_images_give_two_lines():
         ([GOOD] * 3 + [changed(mean=180.0)] * 2, [GOOD] * 5, "WARN", "changes by a factor of 1.8 from frame f2 to f3"),
         ([changed(bright=0.5)] * 5, [GOOD] * 5, "WARN", "50 % of the left images is white"),
         ([GOOD] * 5, [changed(deviation=0.1)] + [GOOD] * 4, "WARN", "1 right images show nothing, first frame f0"),
+        (
+            [changed(deviation=2.0)] * 5,
+            [GOOD] * 5,
+            "WARN",
+            "the left images are faint: their grey values deviate by 2.0",
+        ),
     ],
 )
 def test_bad_images_are_told(left, right, level, words):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,7 +46,7 @@ def pairs(true: Lens, given: Lens, rig: Rig = RIG) -> list[PointPairs]:
 )
 def test_another_reading_is_named_where_it_fits_better(true: tuple, given: tuple, name: str) -> None:
     stated = Lens(CAMERA, *given)
-    said = better_reading(RIG, {"left": stated, "right": stated}, pairs(Lens(CAMERA, *true), stated))
+    said = better_reading(RIG, RIG, {"left": stated, "right": stated}, pairs(Lens(CAMERA, *true), stated))
     assert bool(said) == bool(name)
     assert name in said
 
@@ -54,7 +56,7 @@ def test_a_turned_camera_is_no_other_reading() -> None:
     knocked = Rig(
         CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, 0.0, 0.01]) @ RIG.T_right_left.rotation, [-0.11, 0, 0])
     )
-    assert not better_reading(knocked, {"left": lens, "right": lens}, pairs(lens, lens))
+    assert not better_reading(knocked, knocked, {"left": lens, "right": lens}, pairs(lens, lens))
 
 
 @pytest.mark.parametrize("lens", [Lens(CAMERA, "radtan", RADTAN), Lens(CAMERA)], ids=["distorted", "ideal"])
@@ -62,7 +64,43 @@ def test_a_rotation_between_the_cameras_that_is_transposed_is_named(lens: Lens) 
     turned = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, -0.02, 0.015]), RIG.T_right_left.translation))
     transposed = Rig(CAMERA, CAMERA, RigidTransform(turned.T_right_left.rotation.T, turned.T_right_left.translation))
     matches = pairs(lens, lens, turned)
-    said = better_reading(transposed, {"left": lens, "right": lens}, matches)
+    said = better_reading(transposed, transposed, {"left": lens, "right": lens}, matches)
     assert said.startswith("R between the cameras seems misread")
     assert said.endswith("if it is transposed")
-    assert not better_reading(turned, {"left": lens, "right": lens}, matches)
+    assert not better_reading(turned, turned, {"left": lens, "right": lens}, matches)
+
+
+@pytest.mark.parametrize("lens", [Lens(CAMERA, "radtan", RADTAN), Lens(CAMERA)], ids=["distorted", "ideal"])
+def test_a_focal_length_of_one_camera_that_is_off_is_named(lens: Lens) -> None:
+    longer = replace(CAMERA, fx=1.05 * CAMERA.fx, fy=1.05 * CAMERA.fy)
+    matches = pairs(lens, lens)
+    rig, lenses = replace(RIG, right=longer), {"left": lens, "right": replace(lens, camera=longer)}
+    # The images were undistorted by what is given.
+    raw = lens.distort(matches[0].right, CAMERA)
+    matches = [replace(matches[0], right=lenses["right"].undistort(raw, longer))]
+    said = better_reading(rig, rig, lenses, matches)
+    assert said.startswith("a focal length seems misread")
+    assert "the right camera's is 0.95" in said
+    assert "the left one's 1.05" in said
+
+
+def test_a_baseline_that_points_ahead_is_no_focal_length() -> None:
+    """Over flat ground it moves rows as a focal length does; the rig is repaired then."""
+    rng, lenses = np.random.default_rng(5), {"left": Lens(CAMERA), "right": Lens(CAMERA)}
+    ahead = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), [-0.11, 0.0, 0.02]))
+    rays = CAMERA.rays(rng.uniform((20, 300), (730, 470), (900, 2)))
+    ground = rays / rays[:, 1:2]
+    left, right = CAMERA.project(ground), CAMERA.project(ground + ahead.T_right_left.translation)
+    matches = [PointPairs(0, left, right + rng.normal(0, 0.05, right.shape))]
+    given = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), [-0.112, 0.0, 0.0]))
+    assert not better_reading(given, ahead, lenses, matches)
+
+
+def test_cameras_whose_figures_are_exchanged_are_named() -> None:
+    left, right = Lens(CAMERA), Lens(replace(CAMERA, cx=381.0, cy=247.0))
+    at = pairs(left, left)[0]
+    matches = [replace(at, right=at.right + np.array([11.0, 7.0]))]
+    given, wrong = (Rig(a.camera, b.camera, RIG.T_right_left) for a, b in ((left, right), (right, left)))
+    said = better_reading(wrong, wrong, {"left": right, "right": left}, matches)
+    assert "figures of the two cameras seem misread" in said
+    assert not better_reading(given, given, {"left": left, "right": right}, matches)

@@ -64,6 +64,33 @@ def test_stage_reads_what_orientation_writes():
     assert [p["pair"] for p in meta["per_pair"]] == [0, 10, 20, 30]
 
 
+def stage_facts(rig, pairs):
+    bundles = [Bundle({"left": m.left, "right": m.right}, {"pair": m.pair, "repeated": 0.1}) for m in pairs]
+    return rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, {"orientations": bundles}).meta
+
+
+def test_a_focal_length_of_one_camera_is_the_contradiction_and_no_turn():
+    true = street_rig()
+    longer = replace(true.right, fx=1.05 * true.right.fx, fy=1.05 * true.right.fy)
+    meta = stage_facts(Rig(true.left, longer, true.T_right_left), street())
+    assert meta["contradiction"] == meta["misread"] == meta["warnings"][0]
+    assert "the right camera's is 0.95" in meta["misread"]
+    assert not any("no mount moves" in line for line in meta["warnings"])
+    assert "knocked" not in meta
+    assert "misread" not in stage_facts(true, street(pitch_deg=0.3))
+
+
+def test_matches_beyond_infinity_of_a_transposed_rotation_are_named_as_such():
+    given = street_rig()
+    turned = Rig(
+        given.left, given.right, RigidTransform(rotation_exp([0.01, 0.06, 0.01]), given.T_right_left.translation)
+    )
+    seen = [matches(turned, street_depth, pair=k) for k in range(3)]
+    transposed = RigidTransform(turned.T_right_left.rotation.T, turned.T_right_left.translation)
+    with raises("RIL-752", "if it is transposed"):
+        stage_facts(Rig(given.left, given.right, transposed), seen)
+
+
 def test_a_pair_without_matches_says_nothing_of_the_lenses():
     nothing = Bundle({side: np.zeros((0, 2), np.float32) for side in ("left", "right")}, {"pair": 0, "repeated": 0.0})
     meta = rig_stage.rig_stage.run(RigParams(), {"rig": street_rig().to_dict()}, {"orientations": [nothing]}).meta

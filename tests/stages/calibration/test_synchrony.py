@@ -13,6 +13,7 @@ from rille.stages.calibration.synchrony import best_partners
 from rille.stages.core.declare import Bundle, NoParams
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import extract
+from rille.stages.numeric.robust import mad_sigma
 
 
 @pytest.mark.data
@@ -57,6 +58,18 @@ def test_what_departs_too_far_is_told_by_the_right_images_own_height():
     apart = synchrony.row_offsets(rig, *sides)
     assert len(apart) == 200
     assert np.std(apart) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("stands", [False, True])
+def test_rows_that_a_focal_length_stretches_are_of_no_other_time(stands):
+    camera, centre = Camera(100.0, 100.0, 50.0, 50.0, 100, 100), np.array([-0.1, 0.0, 0.0])
+    rig = Rig(camera, camera, RigidTransform(np.eye(3), centre[[1, 0, 2]] if stands else centre))
+    rng = np.random.default_rng(0)
+    points, descriptors = rng.uniform(10, 90, (200, 2)), np.kron(np.eye(200), np.full(4, 255)).astype(np.uint8)
+    theirs = 50 + 1.05 * (points - 50) + rng.normal(0, 0.1, (200, 2))
+    theirs[:30] += rng.uniform(-9, 9, (30, 2))
+    sides = (Bundle({"points": one + 0.5, "descriptors": descriptors}, {}) for one in (points, theirs))
+    assert mad_sigma(synchrony.row_offsets(rig, *sides)) < 0.25
 
 
 def offsets(spread, count=200):

@@ -102,6 +102,12 @@ def judged(estimate: Floats, true: Floats, record: Floats, offset: float, apart:
     return accuracy_stage(NoParams(), trajectory, **given).meta.get("warnings", [])
 
 
+def test_one_frame_with_pose_and_timed_truth_has_no_errors_to_explain() -> None:
+    poses = circle()
+    alone = np.where(np.arange(len(poses))[:, None, None] == 4, poses, np.nan)
+    assert judged(alone, poses, poses[:, :, 3], 0.0) == []
+
+
 @pytest.mark.parametrize("late", [0.0, 0.3, -0.25])
 @pytest.mark.parametrize("arm", [0.0, 0.4])
 def test_true_poses_of_a_late_clock_are_told_from_those_of_another_body(late: float, arm: float) -> None:

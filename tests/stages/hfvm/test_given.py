@@ -9,7 +9,7 @@ from matching_scenes import Texture
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity, has, matched
-from rille.stages.hfvm.given import check, hfvm_given_stage
+from rille.stages.hfvm.given import check, hfvm_given_stage, otherwise
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import PyramidParams, pyramid_stage
@@ -153,6 +153,38 @@ def test_a_stated_standard_deviation_counts_where_it_is_stated():
     np.testing.assert_array_equal(stated["disparity_std"][:, 150:], estimated["disparity_std"][:, 150:])
     assert np.isnan(stated["disparity_std"][~ok]).all()
     assert stated.meta["match_rate"] == pytest.approx(ok.mean())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "fit"),
+    [
+        (lambda u: -u, "their values times -1"),
+        (lambda u: 16 * u, "their values times 0.0625"),
+        (lambda u: u / 256, "their values times 256"),
+        (lambda u: u / 2, "their values times 2"),
+        (lambda u: u[::-1], "their rows in reverse"),
+        (lambda u: u - 31, ""),
+        (lambda u: u * np.nan, ""),
+    ],
+)
+def test_a_map_that_fits_otherwise_is_named_with_how(wrong, fit):
+    """Ground, which is the nearer the lower it lies."""
+    left = cv2.GaussianBlur(np.random.default_rng(5).uniform(0, 255, SHAPE).astype(np.float32), (0, 0), 1.0)
+    nearer = 4 + np.arange(ROWS) // 8
+    right = np.array([np.roll(row, -by) for row, by in zip(left, nearer, strict=True)])
+    u = np.repeat(-nearer[:, None], COLS, axis=1).astype(np.float32)
+    assert otherwise(left, right, wrong(u)) == fit
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1, []), (16, ["their values times 0.0625"])])
+def test_maps_that_the_images_contradict_are_a_warning(factor, said):
+    usable = np.ones(SHAPE, np.uint8)
+    images = ({"image": image.astype(np.uint8), "valid": usable} for image in scene())
+    left, right = (pyramid_stage(PyramidParams(), Bundle(arrays, {})) for arrays in images)
+    lines = hfvm_given_stage(HfvmParams(), left, right, Bundle({"column_disparity": factor * foreign()}, {})).meta
+    lines = lines.get("warnings", [])
+    assert len(lines) == len(said)
+    assert all(words in line for words, line in zip(said, lines, strict=True))
 
 
 def test_absurd_values_count_as_unknown():

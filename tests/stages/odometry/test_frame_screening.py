@@ -162,6 +162,15 @@ def test_a_run_is_told_of_a_camera_that_shows_grey_rows():
     assert line.startswith("2 of 3 right images show one grey value in 50% of their rows")
 
 
+def test_a_run_is_told_of_a_camera_whose_images_are_faint():
+    qualities = [Bundle({}, {"frame": k} | sight(k)) for k in range(3)]
+    for k in (1, 2):
+        qualities[k].meta["right"]["deviation"] = 2.0
+    inputs = {"qualities": qualities, "steps": tables([motion(shift(9.0))] * 2), "bridges": [], "sides": []}
+    (line,) = frame_screening_stage.run(PARAMS, {"frames": [0, 1, 2]}, inputs).meta["warnings"]
+    assert line.startswith("the right images are faint: their grey values deviate by 2.0")
+
+
 def test_the_stage_looks_at_the_sides_where_displacements_jump():
     steps = [motion(shift(u)) for u in (9.0, 9.5, 9.0, 60.0, -42.0, 9.0)]
     qualities = [Bundle({}, {"frame": k} | sight(k)) for k in range(7)]
