@@ -206,8 +206,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     both = {key: sides for key, sides in groups.items() if all(sides)}
     frames = {(row, re.sub(r"\d+", "", place)) for row, place in both}
     if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
-        left, right = ([sides[k][0] for sides in both.values()] for k in (0, 1))
-        both = {min(both): (left, right)}
+        alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
+        both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
     if not both and (parts := pairing.by_one_word(names)):
         (first, ours), (second, theirs) = parts.items()
         both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
@@ -228,7 +228,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     left, right = both[key]
     sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
-        matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
+        matched = pairing.pair_up(left, right, warnings=lines)  # as the manifest opens
         headers, matched = pairing.common_headers(matched)
         sizes = sizes_of(headers)
     except InputError as error:

@@ -60,9 +60,9 @@ class Images(Table):
     left : folder of the left images below the root, or their pattern, e.g. left/*.png; ** is any folder; or BAG, or
         BAG:TOPIC.
     right : that of the right images, or the same bag.
-    pair : how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp
-        in it, or by order; auto: by name, by time stamps where these differ, else by number; by folder where each frame
-        has its own.
+    pair : how images are paired: by name (left/right aside), by that of their folder, by the last number in the name,
+        by the nearest time stamp in it, or by order; auto: by folder where each frame has its own, by name, by time
+        stamps where these differ, else by number.
     tolerance : s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the
         usual interval, at most 0.01.
     rectified : whether the images are rectified; by default they are where a word of their folders' or files' names
@@ -71,7 +71,7 @@ class Images(Table):
 
     left: str
     right: str
-    pair: Literal["auto", "name", "number", "nearest", "order"] = "auto"
+    pair: Literal["auto", "name", "folder", "number", "nearest", "order"] = "auto"
     tolerance: float | None = Field(default=None, gt=0)
     rectified: bool | None = None
 

@@ -94,9 +94,11 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
     for k, pair in zip((9, 10, 11), pairs, strict=True):
         places = [path.relative_to(tmp_path).as_posix() for path in (pair.left, pair.right)]
         assert places == [name.format(k=k, side=side) for side in ("left", "right")]
-    (tmp_path / name.format(k=10, side="right")).unlink()
-    with raises("RIL-259", "folder"):
-        open_sequence(str(tmp_path / "m.toml"))
+    lost = name.format(k=10, side="right")
+    (tmp_path / lost).unlink()
+    assert open_sequence(str(tmp_path / "m.toml")).lost == {1: f"{lost} is missing"}
+    views = inspect(tmp_path).views
+    assert (views.pairs, views.absent) == (3, (f"{lost} is missing",))
 
 
 @pytest.mark.parametrize(
