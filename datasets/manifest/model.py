@@ -156,7 +156,8 @@ class RigSection(Table):
 
     Attributes
     ----------
-    baseline : m; the right camera stands that far along the left one's x axis.
+    baseline : m; distance of the cameras. Beside calibration files that say how the cameras stand to each other it
+        replaces the distance alone; otherwise the right camera stands that far along the left one's x axis.
     T_right_left : rows of [R | t], m: x_right = R x_left + t.
     file : rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed.
     unit : m; length of one unit of the calibration files, 0.001 where they say mm; 1 lets a baseline exceed 20 m.
