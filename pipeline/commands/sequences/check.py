@@ -92,6 +92,7 @@ class Inspection:
         self.frames = tuple(f for f in frames if f not in self.lost)
         self.levels: Counter[str] = Counter()
         self.broken: set[tuple[int, str]] = set()
+        self.exchanged = False
 
     def say(self, *findings: Finding | None) -> None:
         """Print findings, and count them by level."""
@@ -100,7 +101,9 @@ class Inspection:
             self.levels[finding.level] += 1
 
     def refused(self, error: RilleError, subject: str, where: str = "") -> None:
-        """Print the finding that an error is."""
+        """Print the finding that an error is, unless it names exchanged sides, which were found before."""
+        if self.exchanged and error.code in ("RIL-772", "RIL-781"):
+            return
         self.say(Finding(error.code, f"{where}{error.message}", subject, "FAIL", error.remedy))
 
     def steps(self) -> Steps:
@@ -174,7 +177,9 @@ class Inspection:
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)
         swapped = sum(one["swapped"] for one in facts.values())
-        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
+        sides = judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names)
+        self.say(sides)
+        self.exchanged = sides.level == "FAIL"
         return next((pair for pair in tests if pair not in unlike), whole[0])
 
     def _first_pair(self, pair: int) -> Steps:
@@ -193,7 +198,7 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
         self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
-        if len(left):
+        if len(left) and not self.exchanged:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
