@@ -21,7 +21,7 @@ from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import hints, unread
+from rille.datasets.images.kinds import hints, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
@@ -38,8 +38,6 @@ CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
-
-SPLIT = "if each shows both views: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
 
 
 @dataclass(frozen=True)
@@ -216,10 +214,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if not both:
         counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
-        for path in images[: 0 if any(counts) else 1]:
+        for path in images[: 0 if all(counts) else 1]:
             with suppress(InputError):
                 header = common_header([path]).header
-                remedy = f"{SPLIT}; else {remedy}" if header.width >= 2 * header.height else remedy
+                remedy = (
+                    f"{split('each shows', 'FILE')}; else {remedy}" if header.width >= 2 * header.height else remedy
+                )
         text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)

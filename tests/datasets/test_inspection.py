@@ -536,7 +536,8 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
 @pytest.mark.parametrize(
     ("files", "step"),
     [
-        (["left.mp4", "right.mp4"], "ffmpeg"),
+        (["left.mp4", "right.mp4"], "ffmpeg -i FILE left/%06d.png"),
+        (["drive.mp4"], "if it shows both views: mkdir left right; ffmpeg"),
         (["left/1.npy", "right/1.npy"], "cv2.imwrite"),
         (["left/1.webp", "right/1.webp"], "magick mogrify"),
     ],
@@ -624,9 +625,10 @@ def test_pairing_by_time_stamps_is_proposed(tmp_path):
     assert any("1 image without a partner" in line for line in sequence.warnings)
 
 
-def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path):
-    write_images(tmp_path / "wide", ["1.png", "2.png"], (128, 48))
-    with raises("RIL-194", "if each shows both views: ffmpeg"):
+@pytest.mark.parametrize("place", ["", "left/"])  # those of a video that was taken apart as a left camera's
+def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path, place):
+    write_images(tmp_path / "wide", [f"{place}1.png", f"{place}2.png"], (128, 48))
+    with raises("RIL-194", "if each shows both views: mkdir left right; ffmpeg"):
         inspect(tmp_path / "wide")
     write_images(tmp_path / "one", ["1.png"])
     with pytest.raises(InputError) as caught:
