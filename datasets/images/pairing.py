@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -223,6 +223,13 @@ def without_side(stem: str, side: int) -> str:
     return found[2] if found is not None and found[1] == side else stem
 
 
+def _told_apart(left: Sequence[Path], right: Sequence[Path], part: Callable[[Path], str]) -> dict[Path, str]:
+    """A part of each path without its side's token; whole if images of both sides have one: it tells no side then."""
+    shared = set(map(part, left)) & set(map(part, right))
+    sides = [(path, side) for side, paths in enumerate((left, right)) for path in paths]
+    return {path: part(path) if shared else without_side(part(path), side) for path, side in sides}
+
+
 def pair_up(
     left: Sequence[Path],
     right: Sequence[Path],
@@ -252,13 +259,14 @@ def pair_up(
         An image has no partner, two images make the same pair, the counts differ, or stamps of a pair are apart.
     """
     lines = [] if warnings is None else warnings
-    left, right = (_sorted(paths, side) for side, paths in enumerate((left, right)))
-    if _begun_anew(_ascending([without_side(path.stem, 0) for path in left])):
+    names = _told_apart(left, right, lambda path: path.stem)
+    left, right = (_sorted(paths, names) for paths in (left, right))
+    if _begun_anew(_ascending([names[path] for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
     joined = join(*times, tolerance) if all(times := (_times(left), _times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
-    rule = rule if rule != "auto" else _fitting(left, right, joined)
+    rule = rule if rule != "auto" else _fitting(left, right, names, joined)
     if rule == "order":
         if len(left) != len(right):
             remedy = "remove what is too many, or pair by name or number"
@@ -275,7 +283,9 @@ def pair_up(
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
     root = Path(os.path.commonpath([path.parent.absolute() for path in (*left, *right)]))
-    by_key = _by_key(left, 0, rule, root), _by_key(right, 1, rule, root)
+    if rule == "folder":
+        names = _told_apart(left, right, lambda path: _compared(path, rule, root))
+    by_key = _by_key(left, rule, names), _by_key(right, rule, names)
     if growing:
         by_key = _up_to_last_pair(*by_key)
     shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
@@ -290,23 +300,22 @@ def pair_up(
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
 
-def _fitting(left: Sequence[Path], right: Sequence[Path], joined: TimedPairs | None) -> str:
+def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, str], joined: TimedPairs | None) -> str:
     """The rule by which images are paired if none is stated."""
     # One image each is a pair, whatever their names.
     if len(left) == len(right) == 1:
         return "order"
     if len({path.name for path in left}) == len({path.name for path in right}) == 1:
         return "folder"
-    shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
+    shared = {names[path] for path in left} & {names[path] for path in right}
     if joined is not None and (joined.apart or not shared):
         return "nearest"
     return "name" if shared else "number"
 
 
-def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
-    stems = in_order([without_side(path.stem, side) for path in paths])
-    place = {stem: k for k, stem in enumerate(stems)}
-    return sorted(paths, key=lambda path: (place[without_side(path.stem, side)], natural(str(path))))
+def _sorted(paths: Sequence[Path], names: Mapping[Path, str]) -> list[Path]:
+    place = {name: k for k, name in enumerate(in_order([names[path] for path in paths]))}
+    return sorted(paths, key=lambda path: (place[names[path]], natural(str(path))))
 
 
 def _compared(path: Path, rule: str, root: Path) -> str:
@@ -314,8 +323,8 @@ def _compared(path: Path, rule: str, root: Path) -> str:
     return os.path.relpath(path.parent, root) if rule == "folder" else path.stem
 
 
-def _by_key(paths: Sequence[Path], side: int, rule: str, root: Path) -> dict[str, Path]:
-    """Images by the key of a pair: the name or the folder without the side's token, or the number in the name."""
+def _by_key(paths: Sequence[Path], rule: str, names: Mapping[Path, str]) -> dict[str, Path]:
+    """Images by the key of a pair: the number in the file's name, or what ``names`` says."""
     by_key: dict[str, Path] = {}
     found = [re.findall(r"\d+", path.stem)[::-1] for path in paths]
     # The last number that no two names share; a later one may be that of the camera, or of a file's version.
@@ -325,7 +334,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str, root: Path) -> dict[str
             text = f"{path} has no number in its name and no partner of its name"
             remedy = 'rename the images, or narrow the patterns; a manifest may take them by images.pair = "order"'
             raise InputError("RIL-257", text, remedy=remedy)
-        key = str(int(numbers[last])) if rule == "number" else without_side(_compared(path, rule, root), side)
+        key = str(int(numbers[last])) if rule == "number" else names[path]
         if key in by_key:
             text = f"{by_key[key]} and {path} are the same frame by {rule}"
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")

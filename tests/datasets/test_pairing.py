@@ -111,6 +111,15 @@ def test_a_missing_image_loses_its_pair_alone_where_each_frame_has_its_folder(na
     assert [pair.absent for pair in pairs] == ["", "", f"{lost} is missing", "", ""]
 
 
+@pytest.mark.parametrize("name", ["im", "I", "cam", "image_", "image_0", "view"])
+@pytest.mark.parametrize("place", ["/d/{side}/{name}{k}.png", "/d/{name}{k}/{side}.png"])
+def test_a_word_of_a_side_in_names_that_both_sides_have_tells_no_side(name, place):
+    left, right = (paths(*(place.format(side=s, name=name, k=k) for k in range(12))) for s in ("left", "right"))
+    pairs = pair_up(left, right[:5] + right[6:])
+    assert [(pair.left, pair.right) for pair in pairs] == list(zip(left, right, strict=True))
+    assert [k for k, pair in enumerate(pairs) if pair.absent] == [5]
+
+
 def test_a_stated_rule_is_kept_where_each_frame_has_its_folder():
     sides = [paths(*(f"{k}/{side}.png" for k in range(3))) for side in ("left", "right")]
     for rule, code in (("name", "RIL-258"), ("number", "RIL-257"), ("nearest", "RIL-822")):
