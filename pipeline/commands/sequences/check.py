@@ -101,9 +101,7 @@ class Inspection:
             self.levels[finding.level] += 1
 
     def refused(self, error: RilleError, subject: str, where: str = "") -> None:
-        """Print the finding that an error is, unless it names exchanged sides, which were found before."""
-        if self.exchanged and error.code in ("RIL-772", "RIL-781"):
-            return
+        """Print the finding that an error is."""
         self.say(Finding(error.code, f"{where}{error.message}", subject, "FAIL", error.remedy))
 
     def steps(self) -> Steps:
@@ -207,7 +205,8 @@ class Inspection:
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
         if fitted.ref is None:
-            self.refused(_cause(fitted), "rig")
+            if not self.exchanged:  # which is why no rig fits
+                self.refused(_cause(fitted), "rig")
         elif "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
