@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
 from rille.datasets.text.warning import warning
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -50,10 +51,6 @@ FORMS = (
 SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
-
-
-Reckoned = tuple[RigidTransform | None, ...] | None
-Used = TypeVar("Used")
 
 
 @dataclass(frozen=True)
@@ -233,7 +230,7 @@ def _joined(
 # -- cameras -----------------------------------------------------------------------------------------------------------
 
 
-def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, np.ndarray]:
+def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, Floats]:
     """Cameras of the image topics, and the rotation from the left camera's frame to that of its images."""
     infos = [_info(reader, path, topic) for topic in topics]
     missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
@@ -282,80 +279,59 @@ def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
     return first
 
 
-def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[CalibratedCamera, np.ndarray]:
+def _camera(path: Path, topic: str, given: Mapping[str, Any]) -> tuple[CalibratedCamera, Floats]:
     """Camera of an image topic by its ``camera_info``, and the rotation from its frame to the image's."""
-    rectified = RECTIFIED.search(topic) is not None
-    entries: dict[str, Any] = {
-        "image_width": given["width"],
-        "image_height": given["height"],
-        "projection_matrix": given["p"],
-        "camera_name": topic,
-        "binning_x": given["binning_x"],
-        "binning_y": given["binning_y"],
-        "roi": {key: getattr(given["roi"], key) for key in ("x_offset", "y_offset", "width", "height")},
-    }
-    if rectified:
+    roi = {key: getattr(given["roi"], key) for key in ("x_offset", "y_offset", "width", "height")}
+    distortion_model = given["distortion_model"] or "plumb_bob"
+    entries = {**given, "roi": roi, "camera_name": topic, "distortion_model": distortion_model}
+    fields, turned = Fields(entries, f"{path} {_beside(topic)}"), np.eye(3)
+    if RECTIFIED.search(topic):
+        turned = fields.rigid("r", fields.matrix("r", 3, 3), np.zeros(3)).rotation
         # The images are rectified already: P alone is their camera, and R must not be applied again.
-        entries |= {"camera_matrix": np.reshape(given["p"], (3, 4))[:, :3], "rectification_matrix": np.eye(3)}
-    else:
-        entries |= {"camera_matrix": given["k"], "rectification_matrix": given["r"]}
-        entries |= {"distortion_model": given["distortion_model"] or "plumb_bob", "distortion_coefficients": given["d"]}
-    fields = Fields(entries, f"{path} {_beside(topic)}")
-    turned = fields.rigid("R", np.reshape(given["r"], (3, 3)), np.zeros(3)).rotation if rectified else np.eye(3)
-    return opencv.single(fields, path)[0], turned
+        fields.values |= {"k": fields.matrix("p", 3, 4)[:, :3], "d": [], "r": np.eye(3), "distortion_model": "none"}
+    return opencv.message(fields, path)[0], turned
 
 
 # -- motion ------------------------------------------------------------------------------------------------------------
 
 
 def _movement(
-    reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: np.ndarray
-) -> tuple[Inertial, Reckoned, list[str]]:
+    reader: Any, path: Path, times: tuple[float, ...], frame: str, R_image_camera: Floats
+) -> tuple[Inertial, tuple[RigidTransform | None, ...] | None, list[str]]:
     """Records of IMU and odometry at each frame, and warnings about unusable ones."""
     frames, warnings = _static(reader), list[str]()
-    # frame_id is the frame of the mounted camera; a rectified image is turned by R against it.
-    T_camera_image = RigidTransform(R_image_camera.T, np.zeros(3))
-
-    def used(kind: str, place: Callable[[Any], str], use: Callable[..., Used], otherwise: Used) -> Used:
-        """Result of ``use`` for the only topic of a kind; ``otherwise``, with a warning, if it cannot be used.
-
-        ``use`` takes the topic's name, its messages with their times, and the left image's pose in its frame.
-        """
+    inertial, odometry = Inertial(), None
+    for kind in (IMU, ODOMETRY):
         topics = sorted({c.topic for c in reader.connections if c.msgtype == kind})
         # By stamp, because drivers repeat messages.
         messages = {_stamp(m) or at: m for topic in topics[:1] for at, _, m in _messages(reader, topic)}
         if len(topics) > 1 or (topics and not messages):
             warnings.append(warning("RIL-950", f"{path}: of {', '.join(topics)} none is used: one with messages is"))
         if len(topics) != 1 or not messages:
-            return otherwise
+            continue
         stamps = sorted(messages)
-        sensor = place(messages[stamps[0]])
-        T_sensor_camera = _between(frames, sensor, frame)
+        record = [messages[stamp] for stamp in stamps]
+        sensor = record[0].header.frame_id if kind == IMU else record[0].child_frame_id
         why = f"{FRAMES} does not say how {frame!r} stands in {sensor!r}"
         try:
-            if T_sensor_camera is not None:
+            if (T_sensor_camera := _between(frames, sensor, frame)) is not None:
+                # frame_id is the frame of the mounted camera; a rectified image is turned by R against it.
+                T_sensor_left = T_sensor_camera @ RigidTransform(R_image_camera.T, np.zeros(3))
                 moments = seconds(stamps, f"{path} {topics[0]}", unit="ns")
-                return use(topics[0], moments, [messages[stamp] for stamp in stamps], T_sensor_camera @ T_camera_image)
+                if kind == IMU:
+                    rates = np.array([_vector(m.angular_velocity) for m in record])
+                    forces = np.array([_vector(m.linear_acceleration) for m in record])
+                    inertial = at_frames(ImuRecord(np.array(moments), rates, forces, topics[0]), times, T_sensor_left)
+                else:
+                    poses = tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in record)
+                    # 0.5 s: longest gap over which odometry is interpolated.
+                    between = interpolate(TimedPoses(moments, poses, topics[0]), times, 0.5)
+                    odometry = tuple(T and T @ T_sensor_left for T in between)
+                continue
         except (InputError, ValueError) as error:  # ValueError: quaternions of zeros, forces of NaN
             why = error.message if isinstance(error, InputError) else str(error)
         warnings.append(warning("RIL-951", f"{path}: {topics[0]} is not used: {why}"))
-        return otherwise
-
-    def inertial(topic: str, moments: tuple[float, ...], messages: list[Any], T_imu_left: RigidTransform) -> Inertial:
-        rates, forces = (
-            np.array([[v.x, v.y, v.z] for v in (getattr(m, name) for m in messages)])
-            for name in ("angular_velocity", "linear_acceleration")
-        )
-        return at_frames(ImuRecord(np.array(moments), rates, forces, topic), times, T_imu_left)
-
-    def reckoned(topic: str, moments: tuple[float, ...], messages: list[Any], T_base_left: RigidTransform) -> Reckoned:
-        poses = tuple(_pose(m.pose.pose.position, m.pose.pose.orientation) for m in messages)
-        # 0.5 s: longest gap over which odometry is interpolated.
-        between = interpolate(TimedPoses(moments, poses, topic), times, 0.5)
-        return tuple(None if T is None else T @ T_base_left for T in between)
-
-    by_imu = used(IMU, lambda m: m.header.frame_id, inertial, Inertial())
-    return by_imu, used(ODOMETRY, lambda m: m.child_frame_id, reckoned, None), warnings
+    return inertial, odometry, warnings
 
 
 def _static(reader: Any) -> dict[str, dict[str, RigidTransform]]:
@@ -388,4 +364,8 @@ def _pose(position: Any, turn: Any) -> RigidTransform:
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-    return RigidTransform(rotation, np.array([position.x, position.y, position.z]))
+    return RigidTransform(rotation, np.array(_vector(position)))
+
+
+def _vector(message: Any) -> list[float]:
+    return [message.x, message.y, message.z]

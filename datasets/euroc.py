@@ -17,14 +17,12 @@ from pathlib import Path
 
 from rille.datasets.cameras import read_cameras
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.text import parse_yaml
 from rille.datasets.images.files import Digests
 from rille.datasets.images.pairing import stamp_of
 from rille.datasets.manifest.model import Cameras, Images, Imu, Manifest, Times, Truth
 from rille.datasets.manifest.opening import open_described
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import read_text
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
@@ -101,7 +99,7 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
             text = f"{folder / name} does not say how it stands in the body (T_BS): it is not used"
             warnings.append(warning("RIL-683", text))
             continue
-        file, pose = f"{name}/data.csv", tuple((T_body_sensor.inverse() @ T_body_left).to_list())
+        file, pose = f"{name}/data.csv", T_body_sensor.inverse() @ T_body_left
         if name == IMU:
             imu = Imu(file=file, T_imu_left=pose)
         else:
@@ -116,5 +114,5 @@ def body_pose(folder: Path) -> RigidTransform | None:
     path = folder / "sensor.yaml"
     if not path.is_file():
         return None
-    fields = Fields(parse_yaml(read_text(path, "calibration"), str(path)), str(path))
+    fields = Fields.read(path)
     return fields.pose("T_BS") if "T_BS" in fields else None

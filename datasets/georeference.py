@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from rille.stages.core.arrays import Floats
 
 FORMS = re.compile(
     r"(?i)(EPSG|ESRI|IAU_\d+|IGNF|OGC|urn:ogc:def:crs:EPSG:):|[+{]"
@@ -36,12 +38,12 @@ class Georeference:
         _refuse_places(self.crs)
 
     @property
-    def rotation(self) -> NDArray[np.float64]:
+    def rotation(self) -> Floats:
         """2 x 2: (easting, northing) = rotation @ (x, y) + origin."""
         c, s = math.cos(self.azimuth), math.sin(self.azimuth)
         return np.array([[c, s], [-s, c]])
 
-    def apply(self, points: ArrayLike) -> NDArray[np.float64]:
+    def apply(self, points: ArrayLike) -> Floats:
         """Easting, northing and height (..., 3) of points (..., 3) of the world frame, metres."""
         p = np.asarray(points, dtype=np.float64)
         turned = np.concatenate([p[..., :2] @ self.rotation.T, p[..., 2:]], axis=-1)

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.poses import coverage, meanings, refuse_apart, times_of
-from rille.datasets.protocol import Rows, rows_of
+from rille.datasets.protocol import Rows, Vector, rows_of, vector_of
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
-Up = tuple[float, float, float] | None
+Up = Vector | None
 
 STEADY_RATE = 0.02
 """rad/s, greatest standard deviation of means of the rate over 0.1 s at rest; idle rotors cause 0.007."""
@@ -138,12 +138,9 @@ def _possible(values: Floats, greatest: float, unit: str, table: TextTable) -> N
     wrong = np.argwhere(np.abs(values) > greatest)
     if wrong.size:
         row, axis = wrong[0]
-        raise InputError(
-            "RIL-854",
-            f"{table.name}, line {table.lines[row]}: {values[row, axis]:.3g} {unit} is beyond any sensor "
-            f"({greatest:g} {unit})",
-            remedy="correct or remove that line; give rates in rad/s and accelerations in m/s^2, or name the unit deg",
-        )
+        text = f"{table.name}, line {table.lines[row]}: {values[row, axis]:.3g} {unit} is beyond any sensor"
+        remedy = "correct or remove that line; give rates in rad/s and accelerations in m/s^2, or name the unit deg"
+        raise InputError("RIL-854", f"{text} ({greatest:g} {unit})", remedy=remedy)
 
 
 def _plausible(rates: Floats, forces: Floats, name: str) -> None:
@@ -155,9 +152,8 @@ def _plausible(rates: Floats, forces: Floats, name: str) -> None:
         raise InputError("RIL-187", text, remedy=remedy)
     # Else in multiples of gravity, or without it: the Moon's is more, and no vehicle has five times the Earth's.
     if not 1.2 <= force <= 50.0:
-        text = (
-            f"{name}: accelerations of {force:.3g} are too {'small' if force < 1.2 else 'large'} to be gravity in m/s^2"
-        )
+        wrong = "small" if force < 1.2 else "large"
+        text = f"{name}: accelerations of {force:.3g} are too {wrong} to be gravity in m/s^2"
         remedy = "give them in m/s^2, gravity not taken off (9.81 at rest), or name their unit, as acc_x [mg]"
         raise InputError("RIL-188", text, remedy=remedy)
 
@@ -239,7 +235,8 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         R_reference_imu = parts[p].attitude(moment) if p is not None and p == longest else None
         force = parts[p].up(moment) if p is not None else None
         attitude.append(None if R_reference_imu is None else rows_of(orthonormal(R_reference_imu @ R_imu_left)))
-        up.append(None if force is None else _unit(R_imu_left.T @ force))
+        seen = None if force is None else R_imu_left.T @ force
+        up.append(None if seen is None else vector_of(seen / np.linalg.norm(seen)))
     warnings = (*imu.warnings, *coverage(attitude, at, f"attitude from {imu.name}"))
     return Inertial(tuple(attitude), tuple(up), rows_of(R_imu_left), warnings, notes)
 
@@ -310,8 +307,3 @@ def bins(values: Floats, times: Floats) -> Floats:
     size = max(1, round(BIN / float(np.median(np.diff(times)))))
     count = max(1, len(values) // size)
     return np.asarray(values[: count * size].reshape(count, -1, values.shape[1]).mean(axis=1), dtype=np.float64)
-
-
-def _unit(vector: Floats) -> Up:
-    x, y, z = (float(v) for v in vector / np.linalg.norm(vector))
-    return x, y, z

@@ -325,8 +325,8 @@ def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> Fou
     baseline = None
     if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
         baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    mount = None if poses[0] is None or np.allclose(poses[0].matrix34, np.eye(3, 4)) else poses[0].inverse()
-    return FoundCalibration(names, (cameras[0].size, cameras[-1].size), baseline, len(cameras), mount=mount)
+    sizes = cameras[0].size, cameras[-1].size
+    return FoundCalibration(names, sizes, baseline, len(cameras), mount=cameras[0].mount)
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

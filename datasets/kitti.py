@@ -23,7 +23,6 @@ from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import read_text
 from rille.stages.core.errors import InputError
-from rille.stages.geometry.geometry import RigidTransform
 
 PAIRS = (
     ("image_0", "image_1"),
@@ -34,9 +33,6 @@ PAIRS = (
     ("left", "right"),
 )
 """Names of the image folders, left and right; grey KITTI cameras before colour ones."""
-
-AT_REFERENCE = RigidTransform.identity().to_list()
-"""Pose of a left camera that is the calibration's reference."""
 
 FORMS = (
     ("FOLDER", "two image folders (image_0/1, image_2/3, image_l/r or left/right), calib.txt; poses.txt, times.txt"),
@@ -92,9 +88,8 @@ def manifest_of(folder: Path, sides: tuple[str, str]) -> Manifest:
     poses = next((place for place in places if place.is_file()), None)
     truth = None
     if poses is not None:
-        truth = Truth(file=str(poses), format="kitti", source=f"poses of {poses.name}, as recorded")
-        mount = left.T_camera_reference.inverse().to_list() if left and left.T_camera_reference else AT_REFERENCE
-        truth = truth.model_copy(update={"T_body_left": None if mount == AT_REFERENCE else tuple(mount)})
+        source, mount = f"poses of {poses.name}, as recorded", left and left.mount
+        truth = Truth(file=str(poses), format="kitti", source=source, T_body_left=mount)
     return Manifest(
         name=derived_name(f"kitti-{folder.name}" if standard else folder.name),
         images=Images(left=f"{sides[0]}/*", right=f"{sides[1]}/*"),

@@ -261,11 +261,9 @@ def unread_rotations(table: TextTable) -> tuple[str, ...]:
     named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
     if not named:
         return ()
-    line = (
-        f"{table.name}: its positions alone are read; its columns {', '.join(named)} are no rotations that are known: "
-    )
-    line += "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
-    return (warning("RIL-749", line),)
+    columns = f"its columns {', '.join(named)} are no rotations that are known"
+    write = "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
+    return (warning("RIL-749", f"{table.name}: its positions alone are read; {columns}: {write}"),)
 
 
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
@@ -276,11 +274,8 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
     # Few rows may be such numbers by chance.
     if step < 0.01 or len(places) < MIN_ROUNDED:
         return ()
-    line = (
-        f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0: write "
-        "them in double precision, or less a constant"
-    )
-    return (warning("RIL-709", line),)
+    line = f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0"
+    return (warning("RIL-709", f"{line}: write them in double precision, or less a constant"),)
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
@@ -350,20 +345,17 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
     bare = table.commas and table.columns == len(ORDERED["tum"]) and not STAMP.fullmatch(table.rows[0][0])
     if format == "auto" and bare:
         text = f"{table.name}: nothing says whether its quaternions are x, y, z, w or w, x, y, z"
-        raise InputError(
-            "RIL-745", text, remedy='name its columns, or state format = "tum" (w last) or "euroc" (w first)'
-        )
+        remedy = 'name its columns, or state format = "tum" (w last) or "euroc" (w first)'
+        raise InputError("RIL-745", text, remedy=remedy)
     order = ORDERED.get(form, ())
     more = table.columns > len(order) and (form == "tum" or (format == "auto" and table.header))  # of other meaning
     if not order or table.columns < len(order) or more:
         seen = f"columns {', '.join(table.header)}" if table.header else f"{table.columns} numbers"
         stated = "" if format == "auto" else f" of format {format}"
-        raise InputError(
-            "RIL-264",
-            f"{table.name}, line {table.lines[0]}: {seen} are no pose{stated}",
-            remedy="3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or columns with names (csv), as "
-            "time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg; or state the format",
-        )
+        text = f"{table.name}, line {table.lines[0]}: {seen} are no pose{stated}"
+        named = "columns with names (csv), as time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg"
+        remedy = f"3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or {named}; or state the format"
+        raise InputError("RIL-264", text, remedy=remedy)
     return {name: k for k, name in enumerate(order)}
 
 

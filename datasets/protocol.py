@@ -25,13 +25,20 @@ if TYPE_CHECKING:
 
 CAMERAS = ("left", "right")
 
-Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+Vector = tuple[float, float, float]
+Rows = tuple[Vector, Vector, Vector]
 """A 3 x 3 rotation, row by row."""
+
+
+def vector_of(values: Floats) -> Vector:
+    """Three numbers of an array as plain ones."""
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def rows_of(rotation: Floats) -> Rows:
     """A rotation (3, 3) as plain numbers."""
-    a, b, c = ((float(x), float(y), float(z)) for x, y, z in rotation)
+    a, b, c = map(vector_of, rotation)
     return a, b, c
 
 
@@ -75,7 +82,7 @@ class Positions:
     positions: tuple[tuple[float, ...], ...]
     times: tuple[float, ...] | None = None
     max_gap: float = 0.5
-    lever_arm: tuple[float, float, float] | None = None
+    lever_arm: Vector | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
@@ -116,10 +123,6 @@ class Simulation:
     pad: float
     ground: tuple[float, float, float, float]
     overview: Source | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON form of the rover's own data (the sources have their own keys)."""
-        return {"T_vehicle_left": self.T_vehicle_left.to_list(), "pad": self.pad}
 
 
 @dataclass(frozen=True)
@@ -182,7 +185,7 @@ class Sequence:
     truth_sigma_m: float = 0.0
     truth_sigma_rad: float = 0.0
     truth_mount: RigidTransform | None = None
-    up: tuple[tuple[float, float, float] | None, ...] | None = None
+    up: tuple[Vector | None, ...] | None = None
     attitude: tuple[Rows | None, ...] | None = None
     imu_axes: Rows | None = None
     odometry: tuple[RigidTransform | None, ...] | None = None

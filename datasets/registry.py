@@ -26,7 +26,7 @@ from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
-from rille.datasets.text.reading import Search, is_broken
+from rille.datasets.text.reading import Search, missing_target
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean
 
@@ -134,15 +134,14 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     # os.path, because pathlib raises for impossible names.
     if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
         kind = "file" if path.suffix else "sequence"
-        gone = is_broken(path) and f"it is a link to {os.readlink(path)}, which is missing"
         known = [*BUILT_IN, *MANIFESTS]
         meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
-        remedy = gone or f"{meant} known names: {', '.join(known)}"
+        remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
         raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # The user's manifest overrides the layout.
-    manifest = folder_manifest(path) if number is None and name_or_path and path.is_dir() else None
+    manifest = folder_manifest(path) if number is None and path.is_dir() else None
     if manifest is not None:
         return open_manifest(manifest, digests)
     for module in layouts():
@@ -154,10 +153,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "; ".join([*hints(name_or_path), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
-    remedy = (
-        f"`rille init {shlex.quote(str(name_or_path))}` writes a manifest; `rille datasets list` names what opens"
-        " without one"
-    )
+    remedy = f"`rille init {shlex.quote(name_or_path)}` writes a manifest; `rille datasets list` names what opens "
+    remedy += "without one"
     if beside.is_file():
         remedy = f"give its manifest, {beside}"
     elif bags := [entry.path for entry in Search().entries(path) if is_bag(Path(entry.path))]:

@@ -31,16 +31,20 @@ RIL-999 is an error of the program itself.
 """
 
 
-def texts(scope: ast.AST) -> list[tuple[str, ast.Assign]]:
-    """Assignments of a module or function to one name each, in order of their lines."""
-    found = [node for node in ast.walk(scope) if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)]
-    return [(node.targets[0].id, node) for node in sorted(found, key=lambda node: node.lineno)]
+def texts(scope: ast.Module | ast.FunctionDef) -> list[tuple[str, ast.Assign]]:
+    """Assignments of a module or function to one name each, no parameter, in order of their lines."""
+    nodes, given = (scope.body, []) if isinstance(scope, ast.Module) else (ast.walk(scope), scope.args.args)
+    found = [node for node in nodes if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)]
+    named = [(node.targets[0].id, node) for node in sorted(found, key=lambda node: node.lineno)]
+    return [(name, node) for name, node in named if name not in [one.arg for one in given]]
 
 
 def words(node: ast.expr | None, names: Mapping[str, ast.expr]) -> str:
     """Text of an expression; an ellipsis for what is filled in."""
     if isinstance(node, ast.Name) and isinstance(names.get(node.id), ast.Constant | ast.JoinedStr):
         return words(names[node.id], names)
+    if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Name):
+        return words(node.value, names)
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):

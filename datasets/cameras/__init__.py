@@ -25,17 +25,11 @@ KNOWN = (
 )
 
 Text: TypeAlias = Callable[[str], bool]
-Entries: TypeAlias = Callable[[Fields], bool]
 
 
 def states(entry: str) -> Text:
     """Whether a line of a text begins with ``entry``, a pattern."""
     return lambda text: re.search(rf"^[ \t]*{entry}", text, re.MULTILINE) is not None
-
-
-def has(*keys: str) -> Entries:
-    """Whether one of the keys is an entry."""
-    return lambda f: any(key in f for key in keys)
 
 
 PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (
@@ -51,21 +45,21 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 )
 """Text formats: test and reader of each."""
 
-NESTED: tuple[tuple[Entries, Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
+NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
-    (has("Camera.fx", "Camera1.fx"), slam.orbslam),
+    (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
     (lambda f: any(isinstance(f.values[key], dict) for key in f.values if slam.CAMERA.fullmatch(key)), slam.kalibr),
-    (lambda f: "intrinsics" in f and has("T_BS", "distortion_coefficients")(f), slam.sensor),
-    (has("model_type"), slam.camodocal),
-    (has("cam0_calib"), slam.vins),
-    (has("cameraData"), makers.depthai),
+    (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
+    (lambda f: "model_type" in f, slam.camodocal),
+    (lambda f: "cam0_calib" in f, slam.vins),
+    (lambda f: "cameraData" in f, makers.depthai),
     (lambda f: "pinhole" in f or ("rightToLeft" in f and "left" in f), boofcv.boofcv),
     (opencv.is_message, opencv.message),
-    (has(*opencv.SINGLE), opencv.single),
+    (lambda f: f.has(*opencv.SINGLE), opencv.single),
     (opencv.projections_alone, opencv.projections),
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
     (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
-    (has("value0"), slam.basalt),
+    (lambda f: "value0" in f, slam.basalt),
     (makers.has_figures, makers.figures),
 )
 """Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are

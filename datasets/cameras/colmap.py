@@ -49,8 +49,8 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
             raise f.error("RIL-108", "model", f"{model} is not read", f"one of {', '.join(MODELS)}")
         names, lens = MODELS[model][0].split(), MODELS[model][1]
         if len(values) != len(names):
-            text = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
-            raise f.error("RIL-109", "parameters", text)
+            count = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
+            raise f.error("RIL-109", "parameters", count)
         zeros = dict.fromkeys(COEFFICIENTS[lens].split(), "0")
         stated = dict(zip(names, values, strict=True)) | {"width": width, "height": height}
         f = Fields(zeros | stated, str(path), f.at)
@@ -72,13 +72,12 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
     _, _, _, reference, *rest = lines[0]
     poses = {reference: RigidTransform.identity()}
     while len(rest) >= 3:
-        kind, number, known = rest[:3]
-        rest = rest[3:]
+        kind, number, known, *rest = rest
         if known == "0":
             continue
         f = Fields({"pose": rest[:7]}, str(path), f"sensor {number} ")
         w, x, y, z, *t = f.numbers("pose", 7)
-        if not np.hypot(np.hypot(w, x), np.hypot(y, z)) > 0:
+        if not any((w, x, y, z)):
             raise f.error("RIL-110", "pose", "has a quaternion of length 0")
         rest = rest[7:]
         if kind == "CAMERA":

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
-from rille.datasets.text.reading import GREATEST
+from rille.datasets.cameras.text import parse_nested
+from rille.datasets.text.reading import GREATEST, read_text
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -61,8 +64,21 @@ class Fields:
         self.values, self.file, self.at = {str(k): v for k, v in values.items()}, file, at
         self.used = set[str]() if used is None else used
 
+    @staticmethod
+    def read(path: Path) -> Fields:
+        """Entries of a file of its own beside a calibration."""
+        return Fields(parse_nested(read_text(path, "calibration"), str(path)), str(path))
+
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
+
+    def has(self, *keys: str) -> bool:
+        """Whether one of the keys is an entry."""
+        return any(key in self for key in keys)
+
+    def spelt(self, keys: Sequence[str]) -> str:
+        """The first of several spellings of a key that is an entry; the first of all if none is."""
+        return next((key for key in keys if key in self), keys[0])
 
     def error(self, code: str, key: str, what: str, remedy: str = CORRECT) -> InputError:
         """One line with the file and the full key."""
@@ -126,9 +142,10 @@ class Fields:
 
     def pose(self, key: str) -> RigidTransform:
         """Rigid transform from a 4 x 4 or 3 x 4 matrix."""
-        if len(self.numbers(key)) not in (12, 16):
-            raise self.error("RIL-117", key, f"has {len(self.numbers(key))} numbers, it takes a 4 x 4 matrix")
-        m = np.array(self.numbers(key)).reshape(-1, 4)
+        numbers = self.numbers(key)
+        if len(numbers) not in (12, 16):
+            raise self.error("RIL-117", key, f"has {len(numbers)} numbers, it takes a 4 x 4 matrix")
+        m = np.array(numbers).reshape(-1, 4)
         if len(m) == 4 and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-9:
             raise self.error("RIL-118", key, f"has the last row {m[3].tolist()}, it should be 0 0 0 1")
         return self.rigid(key, m[:3, :3], m[:3, 3])
@@ -144,18 +161,14 @@ class Fields:
 
     def camera(self, key: str, values: tuple[float, float, float, float], size: tuple[int, int]) -> Camera:
         """Camera from fx, fy, cx, cy, pixels; ``key``: of these, for errors."""
-        try:
-            fx, fy, cx, cy = map(float, values)
+        fx, fy, cx, cy = map(float, values)
+        with self._within(key):
             return Camera(fx, fy, cx, cy, *size)
-        except InputError as error:
-            raise self.error(error.code, key, f"gives no camera: {error.message}", error.remedy) from error
 
     def lens(self, key: str, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
         """Lens with a model of :mod:`rille.stages.geometry.lens`; ``key``: of the coefficients, for errors."""
-        try:
+        with self._within(key):
             return Lens(camera, model, coefficients)
-        except InputError as error:
-            raise self.error(error.code, key, f"is wrong: {error.message}", error.remedy) from error
 
     def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
         """Lens of numbers with a key each.
@@ -171,10 +184,19 @@ class Fields:
         fx, fy, cx, cy = (self.number(key) for key in keys)
         camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
         keys = coefficients.split()
-        if not any(key in self for key in keys):
+        if not self.has(*keys):
             return Lens(camera)
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)
         return self.lens(keys[0], camera, model, values[:4] if model == "radtan" and not any(values[4:]) else values)
+
+    def distorted(self, key: str, camera: Camera) -> Lens:
+        """Lens with the coefficients listed at ``key``, if any, and the model that another key may name."""
+        model, coefficients = by_count(self.numbers(key) if key in self else ())
+        stated = self.model(key)
+        # ROS writes five zeros for cameras without distortion, whatever the model.
+        if stated == "fisheye" or (stated and any(coefficients)):
+            model = stated
+        return self.lens(key, camera, model, coefficients)
 
     def model(self, coefficients: str) -> str:
         """Lens model of :mod:`rille.stages.geometry.lens` that any key names; empty if none does.
@@ -227,20 +249,21 @@ class Fields:
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
         """Rigid transform of the numbers at ``key``."""
-        try:
+        with self._within(key):
             return RigidTransform(rotation, translation)
-        except InputError as error:
-            raise self.error(error.code, key, f"is no pose: {error.message}") from error
+
+    def _within(self, key: str) -> AbstractContextManager[None]:
+        """Put the file and the key in front of errors raised inside."""
+        return within(f"{self.file}: {self.at}{key}")
 
 
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
     """Model that OpenCV uses for a number of coefficients, and the coefficients without trailing zeros."""
     k = coefficients
     # OpenCV writes all coefficients of its largest model, with zeros for the terms that were not estimated.
-    if len(k) == 14 and not any(k[12:]):
-        k = k[:12]
-    if len(k) == 12 and not any(k[8:]):
-        k = k[:8]
+    for count, fewer in ((14, 12), (12, 8)):
+        if len(k) == count and not any(k[fewer:]):
+            k = k[:fewer]
     if not k:
         return "none", k
     return ("radtan", k) if len(k) <= 5 else ("rational", k)
@@ -282,11 +305,8 @@ def _flat(value: Any) -> list[Any] | None:
         return list(value.reshape(-1).tolist())
     if not isinstance(value, list | tuple):
         return None
-    flat: list[Any] = []
-    for one in value:
-        part = _flat(one) if isinstance(one, list | tuple) else [one]
-        flat += part or []
-    return flat
+    parts = (_flat(one) if isinstance(one, list | tuple) else [one] for one in value)
+    return [one for part in parts for one in part or []]
 
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:

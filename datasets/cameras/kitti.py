@@ -12,11 +12,11 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.cameras.text import entries
+from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
@@ -71,7 +71,7 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)
 
 
-def decompose(projection: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], RigidTransform]:
+def decompose(projection: Floats, name: str) -> tuple[Floats, RigidTransform]:
     """K (3, 3) and T_camera_reference of a projection matrix P = K [R | t]."""
     m = projection[:, :3]
     # Refuse singular matrices before anything divides by them.

@@ -137,16 +137,16 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
     """The infrared cameras at each resolution, as ``rs-enumerate-devices -c`` prints them."""
     cameras = {}
     placed = RELATIVE.search(text)
-    R, T = (part.split() for part in placed.groups()) if placed else ([], [])
+    R, T = (part.split() for part in placed.groups()) if placed else (None, None)
     for number, body in INFRARED.findall(text):
         rows = ((key.lower(), value.split()) for key, value in re.findall(r"(\w+)[^:\n]*:(.*)", body))
         stated = {key: row if key == "coeffs" else " ".join(row) for key, row in rows}
         f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
-        f.model("coeffs")
         camera = f.optics("fx fy ppx ppy", "none", "", f.size("width", "height")).camera
-        lens = f.lens("coeffs", camera, *by_count(f.numbers("coeffs")))
         pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
-        cameras[number, camera.width, camera.height] = CalibratedCamera(f"Infrared {number}", lens, pose)
+        cameras[number, camera.width, camera.height] = CalibratedCamera(
+            f"Infrared {number}", f.distorted("coeffs", camera), pose
+        )
     return list(cameras.values())
 
 
@@ -164,11 +164,8 @@ def numbers_of_matrix(text: str) -> list[str]:
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     """Two equal parallel cameras of ``K.txt`` with K row by row and a baseline in metres; one camera if that lacks."""
     fx, _, cx, _, fy, cy, _, _, _, *baseline = numbers_of_matrix(text)
-    f = Fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}, str(path))
-    lens = f.optics("fx fy cx cy", "none", "", UNKNOWN_SIZE)
-    if "baseline" not in f:
-        return [CalibratedCamera(path.stem, lens)]
-    return stereo_cameras(lens, lens, parallel(f.number("baseline")))
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}
+    return figures(Fields(values, str(path)), path)
 
 
 def _flat(f: Fields) -> Fields:

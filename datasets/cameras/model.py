@@ -42,6 +42,12 @@ class CalibratedCamera:
         size = (self.lens.camera.width, self.lens.camera.height)
         return None if size == UNKNOWN_SIZE else size
 
+    @property
+    def mount(self) -> RigidTransform | None:
+        """T_reference_camera; None if the file does not state it, or the reference is this camera."""
+        T = self.T_camera_reference
+        return None if T is None or np.allclose(T.matrix34, np.eye(3, 4)) else T.inverse()
+
 
 def of_size(cameras: list[CalibratedCamera], sizes: Sizes | None) -> list[CalibratedCamera]:
     """The two of several cameras whose images have these sizes; all cameras if there are not exactly two."""

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
-from rille.datasets.cameras.text import parse_nested
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.reading import read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -32,6 +30,7 @@ MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectifica
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix", "rotation"), ("T", "translation_vector", "translation")
+POSE = (*ROTATIONS, *TRANSLATIONS)
 
 OST = re.compile(r"^\[?([a-z][\w/ ]*)\]?[ \t]*\n((?:[ \t]*[-+.\d].*\n?|[ \t]*\n)*)", re.MULTILINE)
 OST_KEYS = {
@@ -67,14 +66,14 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     R, T and P1, P2 may be in ``extrinsics.yml`` beside ``intrinsics.yml``, as the sample program writes them. Files
     with LEFT.R and RIGHT.P (rectification, as in ORB-SLAM2) are read too.
     """
-    lenses = [_lens(f, *keys, _size(f, str(k))) for k, keys in enumerate(sides(f), start=1)]
-    poses: tuple[RigidTransform | None, RigidTransform | None]
-    placed = f if any(key in f for key in (*ROTATIONS, *TRANSLATIONS)) else _beside(path) or f
+    keys = enumerate(sides(f), start=1)
+    lenses = [f.distorted(distortion, f.pinhole(matrix, _size(f, str(k)))) for k, (matrix, distortion) in keys]
+    poses: tuple[RigidTransform | None, RigidTransform | None] = None, None
+    placed = f if f.has(*POSE) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
-    else:
-        T_right_left = relative(placed)
-        poses = (None if T_right_left is None else RigidTransform.identity()), T_right_left
+    elif placed.has(*POSE):
+        poses = RigidTransform.identity(), relative(placed)
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
     return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
@@ -97,7 +96,7 @@ def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def projections_alone(f: Fields) -> bool:
     """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before rectification."""
-    return "P1" in f and "P2" in f and not any(key in f for key in (*ROTATIONS, *TRANSLATIONS))
+    return "P1" in f and "P2" in f and not f.has(*POSE)
 
 
 def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -133,13 +132,12 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
 
     The pose of the latter refers to the rectified left camera: ``x_rectified = R x_camera``, and P holds the baseline.
     """
-    matrix = next(key for key in SINGLE if key in f)
-    distortion = next((key for key in DISTORTION if key in f), DISTORTION[0])
-    T = None
+    matrix, distortion, T = f.spelt(SINGLE), f.spelt(DISTORTION), None
     if "projection_matrix" in f and "rectification_matrix" in f:
         T = _unrectified(f, "rectification_matrix", "projection_matrix")
     name = f.text("camera_name", path.stem)
-    whole = _with_rectified(CalibratedCamera(name, _lens(f, matrix, distortion, _size(f)), T), f, "projection_matrix")
+    lens = f.distorted(distortion, f.pinhole(matrix, _size(f)))
+    whole = _with_rectified(CalibratedCamera(name, lens, T), f, "projection_matrix")
     rectified = whole.rectified and replace(whole.rectified, lens=_read_out(f, whole.rectified.lens))
     return [replace(whole, lens=_read_out(f, whole.lens), rectified=rectified)]
 
@@ -170,34 +168,17 @@ def _read_out(f: Fields, lens: Lens) -> Lens:
     return replace(lens, camera=f.camera("roi", (whole.fx / x, whole.fy / y, *centre), size))
 
 
-def _lens(f: Fields, matrix: str, distortion: str, size: tuple[int, int]) -> Lens:
-    camera = f.pinhole(matrix, size)
-    coefficients = f.numbers(distortion) if distortion in f else ()
-    model, coefficients = by_count(coefficients)
-    stated = f.model(distortion)
-    # ROS writes five zeros for cameras without distortion, whatever the model.
-    if stated == "fisheye" or (stated and any(coefficients)):
-        model = stated
-    return f.lens(distortion, camera, model, coefficients)
-
-
 def _size(f: Fields, side: str = "") -> tuple[int, int]:
     """Width and height; ``side``: 1 left, 2 right; ``rille calibrate`` writes both sizes if they differ."""
     for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
             return f.pair_of_pixels(key)
-    width = next((key for key in WIDTHS if key in f), WIDTHS[0])
-    height = next((key for key in HEIGHTS if key in f), HEIGHTS[0])
-    return f.size(width, height)
+    return f.size(f.spelt(WIDTHS), f.spelt(HEIGHTS))
 
 
 def relative(f: Fields) -> RigidTransform | None:
     """T_right_left of R and T; None if there is neither."""
-    rotation = next((key for key in ROTATIONS if key in f), None)
-    translation = next((key for key in TRANSLATIONS if key in f), None)
-    if rotation is None and translation is None:
-        return None
-    return f.transform(rotation or ROTATIONS[0], translation or TRANSLATIONS[0])
+    return f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS)) if f.has(*POSE) else None
 
 
 def _beside(path: Path) -> Fields | None:
@@ -205,10 +186,7 @@ def _beside(path: Path) -> Fields | None:
     if "intrinsic" not in path.name:
         return None
     other = path.with_name(path.name.replace("intrinsic", "extrinsic"))
-    if not other.is_file():
-        return None
-    text = read_text(other, "calibration")
-    return Fields(parse_nested(text, str(other)), str(other))
+    return Fields.read(other) if other.is_file() else None
 
 
 def _with_rectified(raw: CalibratedCamera, f: Fields, projection: str) -> CalibratedCamera:

@@ -57,11 +57,9 @@ def rig_of(
     lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
     if left.T_camera_reference is None or right.T_camera_reference is None:
         lacking = left if left.T_camera_reference is None else right
-        text = (
-            f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where "
-            f"{lacking.name} stands"
-        )
-        raise InputError("RIL-128", text, remedy="give the baseline in metres, or a stereo calibration")
+        text = f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where"
+        remedy = "give the baseline in metres, or a stereo calibration"
+        raise InputError("RIL-128", f"{text} {lacking.name} stands", remedy=remedy)
     T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
     # 1e-6: below, in any usual unit of length, both cameras stand in one place.
@@ -71,13 +69,11 @@ def rig_of(
     to_the_right = float(rig.centre[0])
     # A rig with a mainly vertical baseline has no sides.
     if to_the_right < -0.5 * rig.baseline:
-        raise InputError(
-            "RIL-130",
-            f"swapped cameras: the right camera {right.name} stands {-to_the_right:.4g} m to the left of the left "
-            f"camera {left.name}",
-            remedy="invert the transformation if it leads from right to left; else exchange left and right, "
-            "of the images too if they are swapped as well or show all upside down",
-        )
+        place = f"stands {-to_the_right:.4g} m to the left of the left camera {left.name}"
+        text = f"swapped cameras: the right camera {right.name} {place}"
+        remedy = "invert the transformation if it leads from right to left; else exchange left and right"
+        more = "of the images too if they are swapped as well or show all upside down"
+        raise InputError("RIL-130", text, remedy=f"{remedy}, {more}")
     distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
     return rig, distorted or None
 
@@ -94,15 +90,11 @@ def _check_scale(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Size
     for camera, c, one, (width, height) in zip(cameras, both, scales, sizes, strict=True):
         scale = sum(one) / 2
         if abs(0.5 / scale - 0.5) > MAX_OFF_CENTRE:
-            text = (
-                f"the principal point of camera {camera.name} is the centre of images of some {2 * c.cx + 1:.0f} x "
-                f"{2 * c.cy + 1:.0f} pixels, the images are {width} x {height}"
-            )
-            remedy = (
-                f"give the calibration of images of this size (fx, fy, cx and cy times {scale:.2g}); if it is theirs, "
-                "state it with width and height in a manifest"
-            )
-            raise InputError("RIL-974", text, remedy=remedy)
+            centre = f"the centre of images of some {2 * c.cx + 1:.0f} x {2 * c.cy + 1:.0f} pixels"
+            text = f"the principal point of camera {camera.name} is {centre}, the images are {width} x {height}"
+            remedy = f"give the calibration of images of this size (fx, fy, cx and cy times {scale:.2g})"
+            more = "if it is theirs, state it with width and height in a manifest"
+            raise InputError("RIL-974", text, remedy=f"{remedy}; {more}")
 
 
 def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.text.reading import SMALL, open_regular
+from rille.stages.core.arrays import Floats
+from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 
 BEGINS = (b"PDS_VERSION_ID", b"ODL_VERSION_ID", b"CCSD3ZF", b"LBLSIZE=")
@@ -29,8 +30,7 @@ COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(
 TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
 UNIT = re.compile(r"<[^<>]{0,40}>")
 
-COUNTS = {"CAHV": 4, "CAHVOR": 6, "CAHVORE": 8}
-"""Fewest components of each model."""
+MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
 
 def attached(path: Path) -> str:
@@ -51,7 +51,7 @@ def attached(path: Path) -> str:
 
 def is_label(text: str) -> bool:
     """Whether this is the text of a label with a camera."""
-    return GROUP.search(text) is not None or PROPERTY.search(text) is not None
+    return bool(_model(text))
 
 
 def label(text: str, path: Path) -> list[CalibratedCamera]:
@@ -61,36 +61,30 @@ def label(text: str, path: Path) -> list[CalibratedCamera]:
     """
     f = _entries(text, path)
     kind = f.text("MODEL_TYPE")
-    if kind not in COUNTS:
-        raise f.error("RIL-952", "MODEL_TYPE", f"= {kind} is not read", f"{', '.join(COUNTS)} are")
-    c, a, h, v = (np.array(f.numbers(f"MODEL_COMPONENT_{k}", 3)) for k in range(1, 5))
-    axis = a = _unit(f, "MODEL_COMPONENT_2", a)
-    radial, linearity = (0.0, 0.0, 0.0), 1.0
+    if kind not in MODELS:
+        raise f.error("RIL-952", "MODEL_TYPE", f"= {kind} is not read", f"{', '.join(MODELS)} are")
+    camera, axes, skew = _pinhole(f)
+    T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ f.numbers("MODEL_COMPONENT_1", 3))
+    axis, linearity = axes[2], 1.0
+    radial: tuple[float, ...] = (0.0, 0.0, 0.0)
     if kind != "CAHV":
-        axis = _unit(f, "MODEL_COMPONENT_5", np.array(f.numbers("MODEL_COMPONENT_5", 3)))
-        r0, r1, r2 = f.numbers("MODEL_COMPONENT_6", 3)
-        radial = (r0, r1, r2)
+        axis, radial = _unit(f, "MODEL_COMPONENT_5"), f.numbers("MODEL_COMPONENT_6", 3)
     if kind == "CAHVORE":
         f.numbers("MODEL_COMPONENT_7", 3)  # of near points alone
         linearity = _linearity(f)
-    return [_camera(f, path.stem, _Model(c, a, h, v, axis, radial, linearity))]
+    # 1e-6 of the focal length: below, columns and rows are perpendicular.
+    if not any(radial) and linearity == 1.0 and abs(skew) <= 1e-6 * camera.fy:
+        lens = Lens(camera)
+    else:
+        terms = (skew, *map(float, axes @ axis), *radial, linearity)
+        lens = f.lens("MODEL_COMPONENT_5", camera, "cahvore", terms)
+    return [CalibratedCamera(path.stem, lens, T_camera_reference)]
 
 
-class _Model(NamedTuple):
-    """Components C, A, H, V (3,) of a camera; of its lens ``axis`` O, ``radial`` terms R and ``linearity``."""
-
-    c: np.ndarray
-    a: np.ndarray
-    h: np.ndarray
-    v: np.ndarray
-    axis: np.ndarray
-    radial: tuple[float, float, float]
-    linearity: float
-
-
-def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
-    """Camera with its axes along A and along columns: x is the part of H across A."""
-    a, h, v = model.a, model.h, model.v
+def _pinhole(f: Fields) -> tuple[Camera, Floats, float]:
+    """Camera by A, H and V, its axes x, y, z as rows, and its skew, px: z is A, and x the part of H across A."""
+    a = _unit(f, "MODEL_COMPONENT_2")
+    h, v = (np.array(f.numbers(f"MODEL_COMPONENT_{k}", 3)) for k in (3, 4))
     cx, cy = float(h @ a), float(v @ a)
     fx = float(np.linalg.norm(h - cx * a))
     if fx <= 1e-6 * abs(cx):
@@ -101,26 +95,20 @@ def _camera(f: Fields, name: str, model: _Model) -> CalibratedCamera:
     skew, fy = float(v @ x), float(v @ y)
     if fy < 0:
         raise f.error("RIL-953", "MODEL_COMPONENT_4", "mirrors the image", "give a model without mirroring")
-    camera = f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE)
-    axes = np.array([x, y, a])
-    T_camera_reference = f.rigid("MODEL_COMPONENT_2", axes, -axes @ model.c)
-    # 1e-6 of the focal length: below, columns and rows are perpendicular.
-    if not any(model.radial) and model.linearity == 1.0 and abs(skew) <= 1e-6 * fy:
-        lens = Lens(camera)
-    else:
-        terms = (skew, *map(float, axes @ model.axis), *model.radial, model.linearity)
-        lens = f.lens("MODEL_COMPONENT_5", camera, "cahvore", terms)
-    return CalibratedCamera(name, lens, T_camera_reference)
+    return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE), np.array([x, y, a]), skew
+
+
+def _model(text: str) -> str:
+    """Text of the first camera model of a label; empty if it has none."""
+    for opens, closes in ((GROUP, GROUP_END), (PROPERTY, PROPERTY_END)):
+        if begin := opens.search(text):
+            return closes.split(text[begin.end() :], maxsplit=1)[0]
+    return ""
 
 
 def _entries(text: str, path: Path) -> Fields:
     """The first camera model of a label: its type and components."""
-    begin, close = GROUP.search(text), GROUP_END
-    if begin is None:
-        begin, close = PROPERTY.search(text), PROPERTY_END
-    assert begin is not None
-    end = close.search(text, begin.end())
-    part = UNIT.sub(" ", text[begin.end() : end.start() if end else len(text)])
+    part = UNIT.sub(" ", _model(text))
     values: dict[str, object] = {}
     for number, value in COMPONENT.findall(part):
         words = value.strip("()").replace(",", " ").split()
@@ -131,7 +119,8 @@ def _entries(text: str, path: Path) -> Fields:
     return Fields(values, str(path), "GEOMETRIC_CAMERA_MODEL.")
 
 
-def _unit(f: Fields, key: str, vector: np.ndarray) -> np.ndarray:
+def _unit(f: Fields, key: str) -> Floats:
+    vector = np.array(f.numbers(key, 3))
     length = float(np.linalg.norm(vector))
     # 1e-3: largest error of A and O by the digits of the label.
     if not abs(length - 1.0) < 1e-3:

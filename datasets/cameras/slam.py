@@ -11,8 +11,6 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
-from rille.datasets.cameras.text import parse_nested
-from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -82,7 +80,7 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
     cameras = []
     for name in sorted(key[:4] for key in f.values if re.fullmatch(r"cam\d_calib", key)):
         other = path.parent / f.text(f"{name}_calib")
-        part = Fields(parse_nested(read_text(other, "calibration"), str(other)), str(other))
+        part = Fields.read(other)
         T = f.pose(f"body_T_{name}").inverse() if f"body_T_{name}" in f else None
         cameras += [replace(camera, name=name, T_camera_reference=T) for camera in camodocal(part, other)]
         part.check_lens()
@@ -122,14 +120,10 @@ def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:
 def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     kind = f.text("camera_model", "pinhole")
     if kind.lower() != "pinhole":
-        raise f.error(
-            "RIL-135", "camera_model", f"= {kind!r} is not read", "calibrate as pinhole with radtan or equidistant"
-        )
+        remedy = "calibrate as pinhole with radtan or equidistant"
+        raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
     fx, fy, cx, cy = f.numbers("intrinsics", 4)
-    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution"))
-    coefficients = f.numbers(distortion) if distortion in f else ()
-    model = f.model(distortion) or ("radtan" if coefficients else "none")
-    return f.lens(distortion, camera, model, () if model == "none" and not any(coefficients) else coefficients)
+    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution")))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -121,11 +121,8 @@ def _check_extent(text: str, file: str) -> None:
         values += isinstance(event, yaml.ScalarEvent)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST or values > MOST_VALUES:
-            raise InputError(
-                "RIL-759",
-                f"{file} has more than {DEEPEST} levels or {MOST_VALUES} values",
-                remedy="give the calibration file",
-            )
+            large = f"{file} has more than {DEEPEST} levels or {MOST_VALUES} values"
+            raise InputError("RIL-759", large, remedy="give the calibration file")
 
 
 def parse_xml(text: str, file: str) -> Mapping[str, Any]:
@@ -137,9 +134,8 @@ def parse_xml(text: str, file: str) -> Mapping[str, Any]:
         The file is not well formed, or declares entities (which may expand without bound).
     """
     if "<!ENTITY" in text:
-        raise InputError(
-            "RIL-142", f"{file} declares XML entities", remedy="give the calibration file as OpenCV writes it"
-        )
+        remedy = "give the calibration file as OpenCV writes it"
+        raise InputError("RIL-142", f"{file} declares XML entities", remedy=remedy)
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

@@ -38,8 +38,8 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
     keys = ("u_direction", "v_direction", "w_direction")
     axes = np.array([f.numbers(key, 3) if key in f else row for key, row in zip(keys, np.eye(3), strict=True)])
     if np.linalg.det(axes) < 0:
-        text = "and the other two directions mirror the image"
-        raise f.error("RIL-147", "u_direction", text, "give a model without mirroring")
+        mirrored = "and the other two directions mirror the image"
+        raise f.error("RIL-147", "u_direction", mirrored, "give a model without mirroring")
     T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
     found = CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())

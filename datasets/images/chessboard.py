@@ -13,13 +13,10 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import ConfigError, InputError
-
-Grey = NDArray[np.uint8]
 
 LEAST_SIDE = 3
 """Fewest inner corners along a side that distinguish a board from clutter."""
@@ -42,11 +39,8 @@ def parse_corners(text: str) -> tuple[int, int]:
     """
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal() and min(int(columns), int(rows)) >= LEAST_SIDE):
-        raise ConfigError(
-            "RIL-151",
-            f"--corners {text!r} is not COLUMNSxROWS",
-            remedy=f"give inner corners, e.g. 9x6 for a board of 10 x 7 squares; at least {LEAST_SIDE} each",
-        )
+        remedy = f"give inner corners, e.g. 9x6 for a board of 10 x 7 squares; at least {LEAST_SIDE} each"
+        raise ConfigError("RIL-151", f"--corners {text!r} is not COLUMNSxROWS", remedy=remedy)
     return int(columns), int(rows)
 
 
@@ -67,7 +61,7 @@ def board_points(corners: tuple[int, int], square: float) -> Floats:
     return np.stack([square * columns, square * rows, np.zeros(rows.shape)], axis=-1).reshape(-1, 3)
 
 
-def eight_bit(image: AnyArray) -> Grey:
+def eight_bit(image: AnyArray) -> Bytes:
     """Grey image as uint8, for the detection; 16-bit ones are stretched to their range."""
     if image.dtype == np.uint8:
         return np.asarray(image, dtype=np.uint8)
@@ -76,7 +70,7 @@ def eight_bit(image: AnyArray) -> Grey:
     return np.asarray(np.clip(scaled, 0, 255), dtype=np.uint8)
 
 
-def find_size(images: Iterable[Grey]) -> tuple[int, int]:
+def find_size(images: Iterable[Bytes]) -> tuple[int, int]:
     """Inner corners (more, fewer) of the board in most of the images.
 
     In a single image a part of the board, or a pattern of the surroundings, may be detected; the same size in most of
@@ -101,7 +95,7 @@ def find_size(images: Iterable[Grey]) -> tuple[int, int]:
     return max(agreed, key=lambda size: (agreed[size], size[0] * size[1]))
 
 
-def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
+def find_corners(image: Bytes, corners: tuple[int, int]) -> Floats | None:
     """All inner corners (n, 2) column, row of a board, row by row; None if they are not all found."""
     attempts = [(cv2.findChessboardCorners, QUICK), *((cv2.findChessboardCornersSB, flags) for flags in THOROUGH)]
     for find, flags in attempts:
@@ -111,7 +105,7 @@ def find_corners(image: Grey, corners: tuple[int, int]) -> Floats | None:
     return None
 
 
-def is_board(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
+def is_board(image: Bytes, points: AnyArray, corners: tuple[int, int]) -> bool:
     """Whether corners (n, 2) are those of a chessboard: steady steps, and alternating squares."""
     return steady(points, corners) and alternates(image, points, corners)
 
@@ -130,7 +124,7 @@ def steady(points: AnyArray, corners: tuple[int, int]) -> bool:
     return True
 
 
-def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
+def alternates(image: Bytes, points: AnyArray, corners: tuple[int, int]) -> bool:
     """Whether the squares between corners (n, 2) are dark and bright by turns, unlike clutter."""
     grid = np.asarray(points, dtype=np.float32).reshape(corners[1], corners[0], 2)
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
@@ -144,7 +138,7 @@ def alternates(image: Grey, points: AnyArray, corners: tuple[int, int]) -> bool:
     return bool(steps.min() > 0.1 * np.ptp(grey))
 
 
-def refine(image: Grey, points: AnyArray, corners: tuple[int, int]) -> Floats:
+def refine(image: Bytes, points: AnyArray, corners: tuple[int, int]) -> Floats:
     """Corners (n, 2) refined by the grey value gradients around them (OpenCV's cornerSubPix)."""
     grid = np.asarray(points).reshape(corners[1], corners[0], 2)
     spacing = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min()) for axis in (0, 1))

@@ -102,7 +102,7 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
     with within(key):
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
     lacking = list[str]()
-    for name in (lambda path: without_side(path.stem, 0), _number):
+    for name in (lambda path: without_side(path.stem, 0), last_number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
         if len(ours) < len(maps) or len(theirs) < len(lefts):
             continue  # keys are not unique
@@ -118,7 +118,7 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
     raise InputError("RIL-901", text, remedy=remedy)
 
 
-def _number(path: Path) -> int:
+def last_number(path: Path) -> int:
     """The last number in a file's name; -1: none."""
     return int(["-1", *re.findall(r"\d+", path.stem)][-1])
 

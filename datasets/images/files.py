@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from rille.datasets.images.headers import Header, opened, orientation, read_head
 from rille.datasets.images.kinds import KINDS, kind_of
 from rille.datasets.protocol import Source
 from rille.datasets.text.reading import mark, open_regular, read_bytes
+from rille.stages.core.arrays import Bytes
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError
 from rille.stages.imaging.levels import Levels, spread, swapped
@@ -60,7 +61,7 @@ COLOUR = Array(
     "colour", ("row", "col", "band"), "uint8", "grey", "red, green and blue of the left image", optional=True
 )
 
-Grey = NDArray[np.uint8] | NDArray[np.uint16]
+Grey = Bytes | NDArray[np.uint16]
 
 
 def _damage(data: bytes) -> str:
@@ -79,7 +80,7 @@ def _damaged(text: str) -> InputError:
     return InputError("RIL-170", text, remedy=COPY_AGAIN)
 
 
-def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
+def _unpacked(data: bytes) -> tuple[AnyArray | None, str]:
     """Image of an encoded file as stored, None if it cannot be decoded; and its damage, in words.
 
     libjpeg reports damage only on the process's stderr, where other threads may write too, and still returns an image.
@@ -107,7 +108,7 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any] | None, str]:
     return image, "" if padding and int(padding[1]) <= 16 else complaints
 
 
-def _decoded(data: bytes) -> NDArray[Any] | None:
+def _decoded(data: bytes) -> AnyArray | None:
     # Netpbm's text may end with its last number, after which OpenCV needs white space.
     data = data + b"\n" if data[:2] in (b"P2", b"P3") else data
     try:
@@ -121,7 +122,7 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
     return image
 
 
-def _turned_back(image: NDArray[Any], tag: int) -> NDArray[Any]:
+def _turned_back(image: AnyArray, tag: int) -> AnyArray:
     """The image as stored, from one that was turned by its orientation tag."""
     if tag in (6, 8):
         return np.rot90(image, 1 if tag == 6 else -1)
@@ -137,7 +138,7 @@ def decode(data: bytes, name: str, wanted: Header | None = None) -> Grey:
 
 def decode_colour(
     data: bytes, name: str, wanted: Header | None = None, levels: Levels | None = None
-) -> tuple[Grey, NDArray[np.uint8] | None]:
+) -> tuple[Grey, Bytes | None]:
     """Grey image of an encoded file, and its colours if it has any.
 
     Colour becomes grey by ITU-R BT.601, 0.299 R + 0.587 G + 0.114 B; an alpha channel is dropped, an orientation tag
@@ -174,7 +175,7 @@ def decode_colour(
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("RIL-172", f"{name} has samples of type {image.dtype}", remedy=FEWER_BITS)
     image = spread(image, levels)
-    colour: NDArray[np.uint8] | None = None
+    colour: Bytes | None = None
     if image.ndim == 3 and image.shape[2] >= 3:
         three = np.ascontiguousarray(image[:, :, :3])
         # Many grey cameras save three equal bands, which are no colours.
@@ -383,7 +384,7 @@ def image_stage(
     except InputError as error:
         return empty(frame, camera, header, error)
     meta: ImageFacts = {"frame": frame, "camera": camera}
-    arrays: dict[str, NDArray[Any]] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
+    arrays: dict[str, AnyArray] = {"image": image, "valid": np.ones(image.shape, np.uint8)}
     # Colours of left images alone, since ortho images are made of these.
     return Bundle(arrays if colour is None or camera != "left" else arrays | {"colour": colour}, meta)
 

@@ -47,10 +47,9 @@ class MisalignParams(Params):
 
     def words(self) -> str:
         """Change of the right images, in words."""
-        return (
-            f"right images are misaligned on purpose: {self.rows:g} px in the row, {self.roll_deg:g} degrees of roll, "
-            f"{self.pitch_deg:g} of pitch, {self.yaw_deg:g} of yaw; the given rig does not say so"
-        )
+        turns = f"{self.roll_deg:g} degrees of roll, {self.pitch_deg:g} of pitch, {self.yaw_deg:g} of yaw"
+        moved = f"{self.rows:g} px in the row, {turns}"
+        return f"right images are misaligned on purpose: {moved}; the given rig does not say so"
 
 
 def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:

@@ -43,31 +43,21 @@ def examined(sequence: Sequence) -> Sequence:
     images = {camera: [image for source in of for image in _images(source)] for camera, of in sources.items()}
     for source in [of[0] for camera, of in sources.items() if of and not images[camera] and "path" in of[0].hints]:
         files.read_grey(Path(source.hints["path"]))  # raises the error
-    orientations: dict[str, set[int]] = {camera: set() for camera in CAMERAS}
-    for camera, source in ((camera, source) for camera, of in sources.items() for source in of):
-        turned, several = _tags(source)
-        if several:  # as stacks, and both views of a stereo camera
-            text = f"{source.hints['path']} holds several images, and one is read of each file"
-            raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
-        orientations[camera].add(turned)
-    lines = _orientations(*orientations.values())
+    left, right = ({_orientation(source) for source in of} for of in sources.values())
+    lines = _orientations(left, right)
     for camera, of in images.items():
         files.refuse_swapped(of, f"the {camera} images")
-    mosaics = [camera for camera, of in images.items() if of and mosaic(of[0])]
-    for camera in mosaics:
-        text = f"{camera} images are a mosaic of colours (Bayer): convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
-        lines.append(warning("RIL-826", text))
-    for camera in [camera for camera, of in images.items() if any(map(interlaced, of))]:
-        text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
-        lines.append(warning("RIL-832", text))
-    for camera, share in [(camera, fixed_pattern(of)) for camera, of in images.items() if camera not in mosaics]:
+        if of and mosaic(of[0]):
+            remedy = "convert them, as by cv2.cvtColor, COLOR_BayerRGGB2BGR"
+            lines.append(warning("RIL-826", f"{camera} images are a mosaic of colours (Bayer): {remedy}"))
         # 0.2: moving scenes have at most 0.03, with a pattern of 8 grey levels in 256 0.25, of 25 levels 0.7.
-        if share > 0.2:
-            text = (
-                f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise): subtract "
-                "a dark frame, the mean of images that are taken with the lens covered"
-            )
-            lines.append(warning("RIL-833", text))
+        elif (share := fixed_pattern(of)) > 0.2:
+            text = f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise)"
+            remedy = "subtract a dark frame, the mean of images that are taken with the lens covered"
+            lines.append(warning("RIL-833", f"{text}: {remedy}"))
+        if any(map(interlaced, of)):
+            text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
+            lines.append(warning("RIL-832", text))
     chosen_levels = levels.levels_of_sides(*images.values())
     if not any(chosen_levels):
         return replace(sequence, warnings=(*sequence.warnings, *lines))
@@ -91,9 +81,14 @@ def _images(source: Source) -> list[AnyArray]:
     return []
 
 
-def _tags(source: Source) -> tuple[int, bool]:
-    """EXIF's orientation of an image file, 1 if it cannot be read; whether the file has a second image that is no mask
-    or smaller copy of the first."""
+def _orientation(source: Source) -> int:
+    """EXIF's orientation of an image file, 1 if it cannot be read.
+
+    Raises
+    ------
+    InputError
+        The file has a second image that is no mask or smaller copy of the first.
+    """
     turned, several = 1, False
     with (
         catch_warnings(action="ignore"),
@@ -104,7 +99,10 @@ def _tags(source: Source) -> tuple[int, bool]:
         image.seek(1)
         # 254: TIFF's tag of a smaller copy (1) or a mask (4) of another image; pages of a stack have 2.
         several = image.size == size and not getattr(image, "tag_v2", {}).get(254, 0) & (1 | 4)
-    return turned, several
+    if several:  # as stacks, and both views of a stereo camera
+        text = f"{source.hints['path']} holds several images, and one is read of each file"
+        raise InputError("RIL-831", text, remedy="take them apart, a folder a camera: magick FILE left/%06d.png")
+    return turned
 
 
 def mosaic(image: AnyArray) -> bool:

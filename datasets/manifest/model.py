@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
 from rille.datasets.georeference import Georeference, are_degrees, metric_crs
+from rille.datasets.protocol import Vector
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.validation import TAG, validated
 from rille.stages.core.declare import Params
@@ -17,21 +18,23 @@ from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hazard.vehicle import Vehicle
 
 
-def _pose(value: Any) -> tuple[float, ...]:
-    """Twelve numbers, rows of [R | t], of a 3 x 4 or 4 x 4 matrix, flat or in rows."""
+def _pose(value: Any) -> RigidTransform:
+    """A pose, which may be a 3 x 4 or 4 x 4 matrix, flat or in rows."""
+    if isinstance(value, RigidTransform):
+        return value
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.empty(0)
     if matrix.size not in (12, 16):
         raise ValueError("give rows of [R | t], 3 x 4 numbers")
-    return tuple(RigidTransform.from_matrix(matrix).to_list())
+    return RigidTransform.from_matrix(matrix)
 
 
-Pose = Annotated[tuple[float, ...], BeforeValidator(_pose)]
+Pose = Annotated[RigidTransform, PlainValidator(_pose)]
 
 
-def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _direction(value: Vector) -> Vector:
     """A unit vector."""
     length = math.hypot(*value)
     if not length > 0:
@@ -39,7 +42,6 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value[0] / length, value[1] / length, value[2] / length
 
 
-Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_direction)]
 PoseFormat = Literal["auto", "kitti", "tum", "euroc", "csv", "colmap"]
 Columns = dict[Literal["time", "x", "y", "z"], str | int]
@@ -423,7 +425,8 @@ class Manifest(Table):
     Attributes
     ----------
     name : short name, used for folders; the manifest's folder by default.
-    root : folder of all files, relative to the manifest; ${VARIABLE} is allowed.
+    root : folder of all files, relative to the manifest; ${VARIABLE} is allowed. Paths and patterns of files may be
+        absolute.
     defaults : parameters that suit the sequence, e.g. locus.cell_size = 0.05.
     notes : facts that the report repeats.
     """

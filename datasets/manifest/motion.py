@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rille.datasets import protocol
+from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamp_of
 from rille.datasets.imu import at_frames, read_imu
@@ -138,7 +139,7 @@ class MotionReader:
         lines = read_lines(path, "times")
         if self.growing and not path.read_bytes().endswith(b"\n"):  # the last line is still being written
             del lines[-1:]
-        header, found, at = tuple[str, ...](), list[list[str]](), list[int]()
+        header, found = tuple[str, ...](), list[tuple[list[str], int]]()
         images, by_name = False, dict[str, int]()
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
@@ -150,16 +151,16 @@ class MotionReader:
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
             stated = [cell for title, cell in titles.items() if TIME.search(title)]
-            found.append([cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]])
-            at.append(k)
             images = images or bool(names)
-            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(at) - 1 for cell in names or cells[1:2]}
-        if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells in found):
-            found = [[of_two(*cells)] for cells in found]
+            by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(found) for cell in names or cells[1:2]}
+            times = [cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]]
+            found.append((times, k))
+        if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells, _ in found):
+            found = [([of_two(*cells)], k) for cells, k in found]
         units = [unit_of(title) for title in header if TIME.search(title)]
         unit = next((stated for stated in units if stated in UNITS), "auto")
-        column = int(_counts(found))
-        rows = [(cells[column], k) for cells, k in zip(found, at, strict=True)]
+        column = int(_counts([cells for cells, _ in found]))
+        rows = [(cells[column], k) for cells, k in found]
         # Tables may list more images than there are pairs, in any order: if all pairs are found, names decide.
         absent = next((p.left.stem for p in self.pairs if not p.absent and p.left.stem not in by_name), "")
         if by_name and not absent:
@@ -201,10 +202,8 @@ class MotionReader:
             text = f"{table}.file: {path} has {len(poses)} poses for {len(self.pairs)} pairs"
             named = f"; of its columns ({', '.join(rows.header)}) none is called time" if rows.header else ""
             raise IncompleteError("RIL-230", text + named, remedy="give one a pair, or poses with times")
-        if section.T_body_left is None:
-            return poses
-        T_body_left = RigidTransform.from_matrix(section.T_body_left)
-        return tuple(pose and pose @ T_body_left for pose in poses)
+        mount = section.T_body_left
+        return poses if mount is None else tuple(pose and pose @ mount for pose in poses)
 
     def of_times(self, timed: TimedPoses, section: PoseFile | Attitude, table: str) -> Poses:
         """The pose at the time of each pair; None where the file has none about that time."""
@@ -217,7 +216,7 @@ class MotionReader:
         if 2 * sum(pose is not None for pose in poses) < len(poses):
             self.refuse_sparse(section, moved.times or (), table)
         if table == "truth":
-            left = np.zeros(3) if section.T_body_left is None else np.array(section.T_body_left)[3::4]
+            left = np.zeros(3) if section.T_body_left is None else section.T_body_left.translation
             track = tuple(tuple(pose.apply(left).tolist()) for pose in moved.poses if pose)
             self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
         return poses
@@ -233,7 +232,7 @@ class MotionReader:
         if any(t != int(t) for t in times) or section.max_gap >= 1 or 2 * np.count_nonzero(there) >= len(self.pairs):
             return None
         known = dict(zip(map(int, times), timed.poses, strict=True))
-        numbers = [int(["-1", *re.findall(r"\d+", pair.left.stem)][-1]) for pair in self.pairs]
+        numbers = [last_number(pair.left) for pair in self.pairs]
         poses = tuple(map(known.get, numbers))
         if 2 * sum(pose is not None for pose in poses) < len(poses) or len(set(numbers)) < len(numbers):
             return None
@@ -272,8 +271,7 @@ class MotionReader:
         if section.lever_arm is not None:
             text = f"truth.lever_arm: {section.file} holds poses, not positions alone"
             raise InputError("RIL-782", text, remedy="state where the camera is in their body as T_body_left")
-        mount = None if section.T_body_left is None else RigidTransform.from_matrix(section.T_body_left)
-        self.state(truth=self.poses(section, "truth", rows), truth_mount=mount)
+        self.state(truth=self.poses(section, "truth", rows), truth_mount=section.T_body_left)
         self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
     def odometry(self, section: Odometry) -> None:
@@ -290,10 +288,9 @@ class MotionReader:
             raise InputError("RIL-807", text, remedy="remove sigma_m and sigma_deg, or give poses")
         rows, times = self.positions(section, found, "truth")
         self.refuse_sparse(section, times or (), "truth")
-        mount, lever = section.T_body_left, section.lever_arm
-        if mount is not None and lever is None:  # the body's origin is the antenna
-            x, y, z = map(float, RigidTransform.from_matrix(mount).inverse().translation)
-            lever = x, y, z
+        lever = section.lever_arm
+        if section.T_body_left is not None and lever is None:  # the body's origin is the antenna
+            lever = protocol.vector_of(section.T_body_left.inverse().translation)
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
@@ -365,7 +362,7 @@ class MotionReader:
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)
-        inertial = at_frames(shifted, sequence.times, RigidTransform.from_matrix(section.T_imu_left))
+        inertial = at_frames(shifted, sequence.times, section.T_imu_left)
         self.state(
             attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
             up=inertial.up if any(inertial.up) else sequence.up,

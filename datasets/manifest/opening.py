@@ -61,10 +61,10 @@ def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequen
     base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
     if manifest.disparity is not None:
         note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity = _disparity("disparity", manifest.disparity, root, (base, pairs), digests)
+        disparity = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
         base = replace(base, disparity=disparity, notes=(*base.notes, note))
     if manifest.truth_disparity is not None:
-        exact = _disparity("truth_disparity", manifest.truth_disparity, root, (base, pairs), digests)
+        exact = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
         base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
     sequence = MotionReader(root, pairs, base, growing=digests.growing).read(manifest)
@@ -130,12 +130,12 @@ def _disparity(
     key: str,
     stated: DisparityMaps,
     root: Path,
-    found: tuple[Sequence, tuple[ImagePair, ...]],
+    sequence: Sequence,
+    pairs: tuple[ImagePair, ...],
     digests: files.Digests,
 ) -> Callable[[int], Source]:
     """Function that returns the source of another program's, or of the true disparity of a frame; ``key``: name of the
     table."""
-    sequence, pairs = found
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
@@ -213,7 +213,8 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
         for path in paths:
             writable(path.name)
         if not paths:
-            text = "; ".join([f"images.{side} = {pattern!r} finds no file in {root}", *search.closed[:1]])
+            within_root = "" if pattern.startswith("/") else f" in {root}"
+            text = "; ".join([f"images.{side} = {pattern!r} finds no file{within_root}", *search.closed[:1]])
             raise IncompleteError("RIL-217", text, remedy="correct the pattern, root or rights")
         found[side] = paths
     both = sorted(set(found["left"]) & set(found["right"]))

@@ -12,6 +12,7 @@ from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
 from rille.datasets.cameras.model import UNKNOWN_SIZE, of_size, parallel
 from rille.datasets.cameras.pair import MAX_OFF_CENTRE
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
+from rille.datasets.protocol import Vector, vector_of
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import InputError, within
@@ -43,7 +44,7 @@ class Optics:
 
     rig: Rig
     lenses: dict[str, Lens] | None
-    up: tuple[float, float, float] | None
+    up: Vector | None
     warnings: tuple[str, ...]
 
 
@@ -103,12 +104,9 @@ def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[CalibratedCame
 def _rectified(camera: CalibratedCamera) -> CalibratedCamera:
     """The camera of rectified images; the camera itself if it has no distortion."""
     if camera.rectified is None and not camera.lens.ideal:
-        raise InputError(
-            "RIL-816",
-            f"the images are taken as rectified, and the calibration of camera {camera.name} has a "
-            "distortion, which would be taken off twice",
-            remedy="give the calibration of the rectified images (P), or images.rectified = false if they are raw",
-        )
+        text = f"the images are taken as rectified, and the calibration of camera {camera.name} has a distortion"
+        remedy = "give the calibration of the rectified images (P), or images.rectified = false if they are raw"
+        raise InputError("RIL-816", f"{text}, which would be taken off twice", remedy=remedy)
     return camera.rectified or camera
 
 
@@ -159,13 +157,9 @@ def _scaled(camera: CalibratedCamera, unit: float) -> CalibratedCamera:
     return replace(camera, T_camera_reference=RigidTransform(pose.rotation, pose.translation * unit))
 
 
-def direction(
-    stated: tuple[float, float, float], T_camera_reference: RigidTransform | None
-) -> tuple[float, float, float]:
+def direction(stated: Vector, T_camera_reference: RigidTransform | None) -> Vector:
     """A unit direction of the reference frame in the camera's frame."""
-    turned = np.array(stated) if T_camera_reference is None else T_camera_reference.rotation @ np.array(stated)
-    x, y, z = (float(v) for v in turned)
-    return x, y, z
+    return stated if T_camera_reference is None else vector_of(T_camera_reference.rotation @ stated)
 
 
 def _placed(
@@ -205,7 +199,7 @@ def _pinned(path: Path) -> Rig:
 def _stated(section: RigSection, of_files: RigidTransform | None) -> RigidTransform | None:
     """T_right_left of the manifest, whose baseline replaces the length of that of the files alone."""
     if section.T_right_left is not None:
-        return RigidTransform.from_matrix(section.T_right_left)
+        return section.T_right_left
     if section.baseline is None:
         return None
     if of_files is None or not of_files.translation.any():
@@ -216,19 +210,17 @@ def _stated(section: RigSection, of_files: RigidTransform | None) -> RigidTransf
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:
     """Refuse a length (m) that looks like one in another unit, or warn about it, unless the unit is stated."""
+    if baseline <= USUAL_BASELINE or "unit" in section.model_fields_set:
+        return []
     from_files = section.baseline is None and section.T_right_left is None
-    if baseline > LONGEST_BASELINE and "unit" not in section.model_fields_set:
+    if baseline > LONGEST_BASELINE:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"
         remedy = f"did you mean {baseline / 1000:g} or {baseline / 100:g}? {hint}; rig.unit = 1 keeps it"
         raise InputError("RIL-244", text, remedy=remedy)
-    if baseline > USUAL_BASELINE and from_files and "unit" not in section.model_fields_set:
-        line = (
-            f"the baseline is {baseline:g} m: is the calibration's unit the metre, not a centimetre or a "
-            "square of the chessboard? A manifest's rig.unit states its length in metres, 1 keeps it"
-        )
-        return [warning("RIL-716", line)]
-    return []
+    doubt = "is the calibration's unit the metre, not a centimetre or a square of the chessboard?"
+    remedy = "A manifest's rig.unit states its length in metres, 1 keeps it"
+    return [warning("RIL-716", f"the baseline is {baseline:g} m: {doubt} {remedy}")] if from_files else []
 
 
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
@@ -243,10 +235,9 @@ def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: S
         off = max(abs(c.cx - width / 2), abs(c.cy - height / 2)) / width
         # 0.04: limit for a calibration without a size, since cropped images show by nothing else.
         if off > (0.04 if calibrated.size is None else MAX_OFF_CENTRE):
-            place = (
-                f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height} images"
-            )
-            lines.append(warning("RIL-689", f"{side} camera: principal point {place}: were they cut or scaled?"))
+            place = f"({c.cx:g}, {c.cy:g}) px is {100 * off:.3g} % of the width off the centre of {width} x {height}"
+            line = f"{side} camera: principal point {place} images: were they cut or scaled?"
+            lines.append(warning("RIL-689", line))
         if not 0.8 < c.fx / c.fy < 1.25:
             text = f"{side} camera: fx = {c.fx:g} and fy = {c.fy:g} px differ much: no square pixels"
             lines.append(warning("RIL-691", text))

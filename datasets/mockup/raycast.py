@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Floats, Floats32
 
 
 @dataclass(frozen=True)
@@ -23,16 +23,16 @@ class HeightField:
     columns; a block of level k spans 2^k x 2^k cells.
     """
 
-    height: NDArray[np.float32]
+    height: Floats32
     x0: float
     y0: float
     cell: float
-    maxima: NDArray[np.float32]
+    maxima: Floats32
     offsets: NDArray[np.int64]
     widths: NDArray[np.int64]
 
     @staticmethod
-    def build(height: NDArray[np.float32], x0: float, y0: float, cell: float) -> HeightField:
+    def build(height: Floats32, x0: float, y0: float, cell: float) -> HeightField:
         """Height field with its pyramid of block maxima."""
         height = np.ascontiguousarray(height, dtype=np.float32)
         levels = [_largest_of_four(height, 1)]
@@ -66,7 +66,7 @@ class HeightField:
         return np.asarray(_cast(self.height, (self.maxima, self.offsets, self.widths), o, d))
 
 
-def _largest_of_four(a: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+def _largest_of_four(a: Floats32, step: int) -> Floats32:
     """Maxima of 2 x 2 values, a pair of rows and columns each ``step``."""
     rows, cols = a.shape
     corners = [a[i : rows - 1 + i : step, j : cols - 1 + j : step] for i in (0, 1) for j in (0, 1)]

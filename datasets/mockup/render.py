@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 from numba import njit
-from numpy.typing import NDArray
 
 from rille.datasets.facts import ImageFacts
 from rille.datasets.mockup.facts import SceneFacts
@@ -21,6 +20,7 @@ from rille.datasets.mockup.params import RenderParams
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.scene import ALBEDO_LEVELS, height_field
 from rille.datasets.protocol import CAMERAS
+from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Memory, stage
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
@@ -30,7 +30,7 @@ AMBIENT_LIGHT = 0.05
 """Stray light of the room, relative to the lamp on a surface that faces it."""
 
 
-def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> NDArray[np.float64]:
+def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1) -> Floats:
     """Directions (sampling * height * sampling * width, 3) in the bed frame, z = 1 in the camera frame, row-major."""
     offset = (np.arange(sampling) + 0.5) / sampling - 0.5
     x = (np.arange(camera.width)[:, None] + offset).ravel()
@@ -41,7 +41,7 @@ def camera_rays(camera: Camera, T_bed_camera: RigidTransform, sampling: int = 1)
     return np.stack([columns * r[k, 0] + rows * r[k, 1] + r[k, 2] for k in range(3)], axis=-1).reshape(-1, 3)
 
 
-def transform(T_dst_src: RigidTransform, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def transform(T_dst_src: RigidTransform, points: Floats) -> Floats:
     """Points (n, 3) of the source frame in the destination frame; written out for the same reason."""
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     r, t = T_dst_src.rotation, T_dst_src.translation
@@ -52,14 +52,14 @@ class _Bed(NamedTuple):
     """Grids (row, col) of the bed: ``height`` m, ``sunlit`` and ``tint``; ``x0``, ``y0`` of their first cell and
     ``cell``, m; ``rise``: m upwards a metre ahead; ``sun`` (3,) direction towards it."""
 
-    height: NDArray[np.float32]
-    sunlit: NDArray[np.uint8]
-    tint: NDArray[np.uint8]
+    height: Floats32
+    sunlit: Bytes
+    tint: Bytes
     x0: float
     y0: float
     cell: float
     rise: float
-    sun: NDArray[np.float64]
+    sun: Floats
 
 
 @njit(cache=True, nogil=True)
@@ -136,7 +136,7 @@ def _texel(albedo, level, r, c):  # type: ignore[no-untyped-def]
 
 def radiance(
     scene: Bundle, field: HeightField, camera: Camera, T_bed_camera: RigidTransform, sampling: int = 2
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Floats32, Bools]:
     """Radiance of every ray, float32 (row, n, col, n) for n = ``sampling``, NaN beside the bed; and the bed's mask,
     bool (row, col).
 

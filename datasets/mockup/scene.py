@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.mockup import terrain
 from rille.datasets.mockup.facts import SceneFacts
 from rille.datasets.mockup.params import SceneParams
 from rille.datasets.mockup.raycast import HeightField
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, stage
 
 ALBEDO_LEVELS = 7
@@ -85,9 +85,7 @@ def build_scene(p: SceneParams, pad: Disk | None = None, blank: Disk | None = No
     return Bundle(arrays=arrays, meta={"lattice": lattice, "scene": p.model_dump()})
 
 
-def distance(
-    lattice: Mapping[str, Any], shape: tuple[int, ...], spacing: float, x: float, y: float
-) -> NDArray[np.float64]:
+def distance(lattice: Mapping[str, Any], shape: tuple[int, ...], spacing: float, x: float, y: float) -> Floats:
     """Distance (row, col), metres, of the nodes of a grid of the bed from a point."""
     dx = lattice["x0"] + spacing * np.arange(shape[1]) - x
     dy = lattice["y0"] - spacing * np.arange(shape[0]) - y

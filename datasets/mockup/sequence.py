@@ -20,7 +20,7 @@ import numpy as np
 
 from rille.datasets.mockup.params import MockupParams, RenderParams, SceneParams, SetupParams
 from rille.datasets.mockup.rover import START, RoverParams
-from rille.datasets.protocol import CAMERAS, Rows, Sequence, Simulation, Source, rows_of
+from rille.datasets.protocol import CAMERAS, Rows, Sequence, Simulation, Source, Vector, rows_of, vector_of
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
@@ -130,12 +130,9 @@ def _check_on_bed(p: MockupParams, poses: list[RigidTransform]) -> None:
         x, y, _ = pose.translation
         # Not y < 0: a drive begins before the near edge (FIRST_Y_M).
         if abs(x) > 0.5 * p.bed_width or y > p.bed_length:
-            raise ConfigError(
-                "RIL-253",
-                f"mockup: frame {k} stands at x = {x:.2f} m, y = {y:.2f} m, outside the bed of "
-                f"{p.bed_width:g} x {p.bed_length:g} m",
-                remedy="take fewer frames, smaller steps, or a larger bed",
-            )
+            bed = f"the bed of {p.bed_width:g} x {p.bed_length:g} m"
+            text = f"mockup: frame {k} stands at x = {x:.2f} m, y = {y:.2f} m, outside {bed}"
+            raise ConfigError("RIL-253", text, remedy="take fewer frames, smaller steps, or a larger bed")
 
 
 def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] | None:
@@ -147,7 +144,7 @@ def _attitude(p: MockupParams, truth: list[RigidTransform]) -> tuple[Rows, ...] 
     return tuple(rows_of((rotation_exp(e) @ T.rotation.T).T) for e, T in zip(errors, truth, strict=True))
 
 
-def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, float, float], ...] | None:
+def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[Vector, ...] | None:
     """Direction of up in each left camera by an inclinometer with the stated error."""
     if not p.inclinometer:
         return None
@@ -155,8 +152,7 @@ def _up(p: MockupParams, truth: list[RigidTransform]) -> tuple[tuple[float, floa
     for frame, pose in enumerate(truth):
         # A stream for each frame, whose error does not depend on the number of frames.
         error = np.random.default_rng([p.seed, 62, frame]).standard_normal(3)
-        x, y, z = rotation_exp(np.deg2rad(p.up_noise_deg) * error) @ pose.rotation[2]
-        out.append((float(x), float(y), float(z)))
+        out.append(vector_of(rotation_exp(np.deg2rad(p.up_noise_deg) * error) @ pose.rotation[2]))
     return tuple(out)
 
 

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from rille.datasets.mockup.params import SceneParams
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Bytes, Floats, Floats32
 
 OCTAVES = (0.5, 0.25, 0.125, 0.0625, 0.03125, 0.015625, 0.0078125, 0.00390625)
 """Spacings of the relief's octaves, metres. Finer relief, which no camera resolves, is drawn as grain."""
@@ -57,7 +56,7 @@ def relief(p: SceneParams, shape: tuple[int, int]) -> Floats32:
     return out
 
 
-def _sizes(rng: np.random.Generator, count: float, least: float, most: float) -> NDArray[np.float64]:
+def _sizes(rng: np.random.Generator, count: float, least: float, most: float) -> Floats:
     """Diameters of a population with N(>D) ~ D^-2 between ``least`` and ``most``, in order of their placement."""
     n = int(rng.poisson(count))
     u = rng.random(n)
@@ -67,7 +66,7 @@ def _sizes(rng: np.random.Generator, count: float, least: float, most: float) ->
 
 def _patch(
     height: Floats32, cell: float, place: Sequence[float] | Floats, reach: float
-) -> tuple[tuple[slice, slice], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[tuple[slice, slice], Floats, Floats]:
     """Window of the nodes within ``reach`` metres of a place, and their offsets from it, metres.
 
     ``place``: x and y from the upper left node, as shares of the bed's width and length.
@@ -154,7 +153,7 @@ def _beside_each_other(p: SceneParams, cover: float, area: float) -> Iterator[_R
         yield _Rock(diameter / np.sqrt(aspect), aspect, np.array(draws), places)
 
 
-def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[np.float64]:
+def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> Floats:
     """Diameters, metres of the bed, decreasing, of rocks that together cover a share of an area (m2).
 
     The law is that of Golombek and Rapp (1997), doi:10.1029/96JE03319: the share under rocks wider than D metres falls
@@ -172,7 +171,7 @@ def cover_sizes(rng: np.random.Generator, cover: float, area: float) -> NDArray[
     return np.asarray(np.interp(u * number[-1], number, d)[::-1], dtype=np.float64)
 
 
-def _stone(dx: NDArray[np.float64], dy: NDArray[np.float64], rock: _Rock, rough: Floats32) -> Floats32:
+def _stone(dx: Floats, dy: Floats, rock: _Rock, rough: Floats32) -> Floats32:
     """Heights (row, col) of one rock at offsets (dx, dy) from its middle, metres; 0 beside it."""
     a, c, e, g, s = rock.draws
     diameter = rock.diameter
@@ -191,7 +190,7 @@ def _stone(dx: NDArray[np.float64], dy: NDArray[np.float64], rock: _Rock, rough:
     return np.asarray(np.where(q < 1.0, np.maximum(stone, 0.0), 0.0), dtype=np.float32)
 
 
-def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:
+def albedo(p: SceneParams, nodes: tuple[int, int]) -> Bytes:
     """Relative albedo, 128 = mean, uint8, on a grid of half the cell size (2 rows - 1, 2 cols - 1).
 
     Grain in octaves from 33 mm down to a texel, 30-1000 cycles/m. Grain finer than 8 mm also represents the shading of
@@ -208,7 +207,7 @@ def albedo(p: SceneParams, nodes: tuple[int, int]) -> NDArray[np.uint8]:
     return np.clip(128.0 * np.exp(log) + np.float32(0.5), 1, 255).astype(np.uint8)
 
 
-def halve(a: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def halve(a: Bytes) -> Bytes:
     """Next level of a texture: rounded means of 2 x 2, odd sizes edge-replicated."""
     a = np.pad(a, ((0, a.shape[0] % 2), (0, a.shape[1] % 2)), mode="edge")
     # Four bytes add up to 1020.
@@ -216,7 +215,7 @@ def halve(a: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return ((total + 2) >> 2).astype(np.uint8)
 
 
-def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
+def sunlit(height: Floats32, p: SceneParams) -> Bytes:
     """Share of the sun's disc that each node sees, 0..255 (cast shadows only, not the slope's own).
 
     Sixteen points of the disc each cast a sharp shadow; together these have edges that widen with distance.
@@ -246,7 +245,7 @@ def sunlit(height: Floats32, p: SceneParams) -> NDArray[np.uint8]:
     return np.asarray(count.astype(np.uint16) * 255 // points, dtype=np.uint8)
 
 
-def _count_lit(height: Floats32, out: NDArray[np.uint8], across: float, phase: float, drop: float) -> None:
+def _count_lit(height: Floats32, out: Bytes, across: float, phase: float, drop: float) -> None:
     """Add one to ``out`` where light arrives, which moves by (1, ``across``) nodes and descends by ``drop`` metres.
 
     The ceiling of the shade is swept along the rows, S(p) = max(h(q), S(q)) - drop at the node's predecessor q; along

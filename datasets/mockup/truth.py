@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.mockup.facts import ExactFacts, SceneFacts
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.render import camera_rays, transform
 from rille.datasets.mockup.scene import height_field
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 
@@ -16,8 +16,8 @@ SEEN, HIDDEN, OUTSIDE, NO_BED = 0, 1, 2, 3
 
 
 def visible(
-    field: HeightField, camera: Camera, T_bed_camera: RigidTransform, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    field: HeightField, camera: Camera, T_bed_camera: RigidTransform, points: Floats
+) -> tuple[Floats, Bools, Bools]:
     """Pixels of surface points in a camera, and whether it sees them.
 
     Parameters

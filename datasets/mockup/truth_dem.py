@@ -7,20 +7,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.mockup.facts import ElevationFacts, SceneFacts
 from rille.datasets.mockup.raycast import HeightField
 from rille.datasets.mockup.render import transform
 from rille.datasets.mockup.scene import height_field
 from rille.datasets.mockup.truth import visible
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.geometry.geometry import Rig, RigidTransform
 
 
-def true_dem(
-    field: HeightField, lattice: Mapping[str, Any], T_bed_world: RigidTransform
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def true_dem(field: HeightField, lattice: Mapping[str, Any], T_bed_world: RigidTransform) -> tuple[Floats32, Floats]:
     """Elevations at the cell centres of a lattice, where vertical lines of the world frame meet the bed from above.
 
     Parameters
@@ -43,9 +41,7 @@ def true_dem(
     return (start - t).reshape(gx.shape).astype(np.float32), tops + t[:, None] * down
 
 
-def seen_by(
-    field: HeightField, rig: Rig, lefts: Iterable[RigidTransform], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def seen_by(field: HeightField, rig: Rig, lefts: Iterable[RigidTransform], points: Floats) -> Bools:
     """Whether both cameras of at least one pair see each surface point (n, 3) of the bed frame."""
     seen = np.zeros(len(points), dtype=bool)
     T_left_right = rig.T_right_left.inverse()

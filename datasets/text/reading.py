@@ -83,8 +83,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
             file.close()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
-        reason = f"it is a link to {os.readlink(path)}, which is missing" if is_broken(path) else reason
-        text = f"{what} {path} cannot be read: {reason}"
+        text = f"{what} {path} cannot be read: {missing_target(path) or reason}"
         raise InputError("RIL-138", text, remedy="check the path and its rights") from error
     if status.st_size <= most:
         text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
@@ -98,14 +97,15 @@ def mark(status: os.stat_result) -> str:
     return f"{status.st_ino:x}.{status.st_size:x}.{status.st_mtime_ns:x}.{status.st_ctime_ns:x}"
 
 
-def is_broken(path: str | Path) -> bool:
-    """Whether a path is a link to a missing file."""
-    return os.path.islink(path) and not os.path.exists(path)
+def missing_target(path: str | Path, name: str = "it") -> str:
+    """That a path, called ``name``, is a link to a missing file, in words; empty: it is none."""
+    broken = os.path.islink(path) and not os.path.exists(path)
+    return f"{name} is a link to {os.readlink(path)}, which is missing" if broken else ""
 
 
 def is_file(path: str | Path) -> bool:
     """Whether a path is a file, or a broken link, which is reported when it is read."""
-    return os.path.isfile(path) or is_broken(path)
+    return os.path.isfile(path) or bool(missing_target(path))
 
 
 def read_bytes(path: Path, what: str, most: int) -> bytes:
@@ -278,18 +278,20 @@ class Search:
                 return
 
     def matching(self, root: Path, pattern: str) -> list[Path]:
-        """Files whose path below ``root`` matches a pattern, the suffix in any case; ``**`` stands for any folders.
+        """Files that match a pattern below ``root``, or an absolute one, the suffix in any case; ``**`` stands for any
+        folders.
 
         Raises
         ------
         InputError
-            The pattern is empty or absolute, or there are too many files.
+            The pattern names no files, or there are too many.
         """
         *above, last = pattern.split("/")
-        if not last or pattern.startswith("/"):
-            text = f"{pattern!r} is no pattern of files below a folder"
-            raise InputError("RIL-216", text, remedy="give one such as left/*.png, and the folder above as root")
+        if not last:
+            raise InputError("RIL-216", f"{pattern!r} is no pattern of files", remedy="give one such as left/*.png")
         places = [root]
+        if pattern.startswith("/"):
+            places, above = [Path("/")], above[1:]
         for part in above:
             if part == "**":
                 places = [place for top in places for place, _ in self.below(top)]

@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
 from rille.datasets.text.times import undated
 from rille.datasets.text.units import OPERATOR, UNITS, unit_of
 from rille.datasets.text.warning import warning
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError
 
@@ -54,7 +54,7 @@ class TextTable:
         """One column as written: exact, while a float would lose the last digits of a time stamp."""
         return [row[column] for row in self.rows]
 
-    def values(self, columns: Sequence[int]) -> NDArray[np.float64]:
+    def values(self, columns: Sequence[int]) -> Floats:
         """Columns as numbers (rows, columns); NaN for missing values, infinity for other texts."""
         return np.array([[_number(row[column]) for column in columns] for row in self.rows])
 
@@ -72,9 +72,7 @@ class TextTable:
         text += f", the first in line {self.lines[int(missing.argmax())]}"
         return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
-    def measures(
-        self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None
-    ) -> NDArray[np.float64]:
+    def measures(self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None) -> Floats:
         """Columns as :meth:`numbers`, times ``unit``, or by default times the unit in a column's name.
 
         Raises
@@ -91,7 +89,7 @@ class TextTable:
             factors.append(units.get(stated, 1.0) if unit is None else unit)
         return self.numbers(columns) * factors
 
-    def numbers(self, columns: Sequence[int], gaps: bool = False) -> NDArray[np.float64]:
+    def numbers(self, columns: Sequence[int], gaps: bool = False) -> Floats:
         """Columns as numbers below ``GREATEST``, (rows, columns); with ``gaps`` whole rows may be NaN.
 
         Raises

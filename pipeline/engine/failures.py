@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import errno
-import os
 import tempfile
 from pathlib import Path
 
-from rille.datasets.text.reading import is_broken
+from rille.datasets.text.reading import missing_target
 from rille.stages.core.errors import ConfigError, RilleError
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -45,9 +44,8 @@ def reason_of(error: OSError) -> str:
     if not error.filename and error.errno == errno.ENOENT:
         return "the current folder was removed"
     path = Path(str(error.filename or ""))
-    if gone := [link for link in (path, *path.parents) if is_broken(link)]:
-        return f"{gone[0]} is a link to {os.readlink(gone[0])}, which is missing"
-    return str(error.strerror)
+    links = (missing_target(link, str(link)) for link in (path, *path.parents))
+    return next(filter(None, links), str(error.strerror))
 
 
 def remedy_of(number: int) -> str:

@@ -343,10 +343,7 @@ def check_group(path: Path) -> None:
     import zarr
     from zarr.storage import LocalStore
 
-    # Rille writes none of these, and the target of a link is no part of the run.
-    for file in (path, *(Path(entry.path) for _, entries in Search().below(path, hidden=True) for entry in entries)):
-        if file.is_symlink() or not (file.is_file() or file.is_dir()):
-            raise InputError("RIL-723", f"{file} is no regular file", remedy=OURS)
+    refuse_irregular(path)
     for name, array in zarr.open_group(store=LocalStore(path, read_only=True), mode="r").arrays():
         # 10_000_000: longest axis, because coordinates are always read whole.
         if max(array.shape, default=0) > 10_000_000 or math.prod(array.chunks) > MAX_CELLS:
@@ -358,3 +355,16 @@ def check_group(path: Path) -> None:
         if array.metadata.zarr_format != 2 or codecs - {"zlib", "blosc"} or packed > 4_000_000:
             text = f"{path}: {name} is packed as Rille packs nothing, and may unpack to any size"
             raise InputError("RIL-997", text, remedy=OURS)
+
+
+def refuse_irregular(path: Path) -> None:
+    """Refuse a path of a run with links or pipes in it: Rille writes none, and a link's target is no part of the run.
+
+    Raises
+    ------
+    InputError
+        There is one.
+    """
+    for file in (path, *(Path(entry.path) for _, entries in Search().below(path, hidden=True) for entry in entries)):
+        if file.is_symlink() or not (file.is_file() or file.is_dir()):
+            raise InputError("RIL-723", f"{file} is no regular file", remedy=OURS)

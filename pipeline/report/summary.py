@@ -104,7 +104,13 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         lines += facts_of(view, handle).get("warnings") or []
     # Against truth that was misread no standard deviation can hold.
     misread = bool(facts_of(view, p.accuracy).get("warnings"))
-    lines += _blurred(view) + _sensors(view) + ([] if misread else _small_sigma(figures)) + _displaced(view)
+    lines += (
+        _blurred(view)
+        + _sensed_turns(view)
+        + _verticals(view)
+        + ([] if misread else _small_sigma(figures))
+        + _displaced(view)
+    )
     if compared is not None and compared.flagged.any():
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
@@ -207,16 +213,22 @@ def _blurred(view: RunView) -> list[str]:
     return [text] if blur else []
 
 
-def _sensors(view: RunView) -> list[str]:
-    """The IMU contradicts the images by its rotations, or it or a stated vertical the ground that they show."""
+def _sensed_turns(view: RunView) -> list[str]:
+    """The IMU contradicts the images by its rotations."""
+    s, trajectory = view.sequence, view.bundle(view.products.trajectory)
+    if s.imu_axes is None or s.attitude is None or s.times is None or trajectory is None:
+        return []
+    frames, unknown = trajectory.meta["frames"], np.full((3, 3), np.nan)
+    sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
+    times = np.array([s.times[f] for f in frames])
+    return imu_check.of_rotations(world_poses(trajectory)[:, :, :3], sensed, times, np.array(s.imu_axes))
+
+
+def _verticals(view: RunView) -> list[str]:
+    """The IMU, an attitude or a stated pitch contradicts the ground that the images show."""
     # The ground also where elevations are measured from another plane.
     s, trajectory, levels = view.sequence, view.bundle(view.products.trajectory), view.products.ground
-    axes, lines = None if s.imu_axes is None else np.array(s.imu_axes), []
-    if axes is not None and s.attitude is not None and trajectory is not None and s.times is not None:
-        frames, unknown = trajectory.meta["frames"], np.full((3, 3), np.nan)
-        sensed = np.array([unknown if s.attitude[f] is None else s.attitude[f] for f in frames], dtype=float)
-        times = np.array([s.times[f] for f in frames])
-        lines += imu_check.of_rotations(world_poses(trajectory)[:, :, :3], sensed, times, axes)
+    axes, lines = None if s.imu_axes is None else np.array(s.imu_axes), list[str]()
     shown = {k: cast(GroundFacts, b.meta) for k, level in levels.items() if (b := view.bundle(level)) is not None}
     for source, stated in (("attitude", None), ("pitch", s.pitch)):
         told = {k: up for k, facts in shown.items() if facts["source"] == source and (up := seen_up(facts)) is not None}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -72,6 +73,37 @@ def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(plac
     report = json.loads((run / "report.json").read_text())
     assert not report["complete"]
     assert [item["kind"] for item in report["absent"]] == ["part"]
+
+
+def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None:
+    crate, runs = tmp_path / "crate", tmp_path / "runs"
+    exported = place.rille("export", "other", "--to", "rocrate", "--output", crate)
+    assert (exported.status, exported.err) == (0, "")
+    metadata = json.loads((crate / "ro-crate-metadata.json").read_text())
+    entities = {one["@id"]: one for one in metadata["@graph"]}
+    assert entities["ro-crate-metadata.json"]["conformsTo"] == {"@id": "https://w3id.org/ro/crate/1.1"}
+    parts = {part["@id"] for part in entities["./"]["hasPart"]}
+    assert {"dem.tif", "config.toml", "terrain.zarr/.zattrs", "trajectory.tum"} <= parts
+    assert all(hashlib.sha256((crate / name).read_bytes()).hexdigest() == entities[name]["sha256"] for name in parts)
+    image = hashlib.sha256(next((place.folder / "other" / "left").iterdir()).read_bytes()).hexdigest()
+    assert image in {entities[one["@id"]].get("value") for one in entities["#run"]["object"]}
+    again = place.rille("reconstruct", crate, "--jobs", "1", "--runs", runs)
+    assert again.status == 0, again.err
+    assert re.fullmatch(rf"(\d+) of \1 results are those of {crate}, to the bit", again.last)
+    other = place.rille(
+        "reconstruct", crate, "--jobs", "1", "--runs", runs, "--set", "merge.alike=0.5", "--only", "dem.tif"
+    )
+    assert other.status == 3
+    assert "RIL-041" in other.err
+
+
+@pytest.mark.parametrize(
+    "content", ["{", '{"@graph": []}', '{"@graph": [{"@id": "#run", "name": "rm -r x", "result": []}]}']
+)
+def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, content: str) -> None:
+    (tmp_path / "ro-crate-metadata.json").write_text(content)
+    refused = place.here("reconstruct", str(tmp_path))
+    assert (refused.status, "RIL-023" in refused.complaint) == (2, True)
 
 
 def test_reconstruct_says_how_it_goes(place: Place) -> None:

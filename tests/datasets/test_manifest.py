@@ -750,7 +750,7 @@ def test_bad_manifests(tmp_path, parts, expected):
             ("RIL-217", "'lft/*.png'"),
         ),
         ('left = "*/*.png"\nright = "right/*.png"', ("RIL-218",)),
-        ('left = "/left/*.png"\nright = "right/*.png"', ("RIL-216", "'/left/*.png'")),
+        ('left = "/left/*.png"\nright = "right/*.png"', ("RIL-217", "'/left/*.png' finds no file:")),
         ('left = "left/*.png"', ("RIL-223", "images.right")),
         ('left = "left/*.png"\nright = "right/00.png"', ("RIL-259", "01.png")),
         ('left = "left/*.png"\nright = "right/*.png"\npair = "size"', ("RIL-223", "images.pair", "'size'")),
@@ -761,6 +761,17 @@ def test_bad_patterns(tmp_path, line, expected):
     path.write_text(f"[images]\n{line}\n")
     with raises(*expected):
         opened(path)
+
+
+def test_images_at_absolute_paths(tmp_path):
+    """They may lie in folders that no root has in common."""
+    path = write_sequence(tmp_path)
+    left, right = f'"{tmp_path}/left/*.png"', f'"{tmp_path}/right"'
+    text = path.read_text().replace('"left/*.png"', left).replace('"right/*.png"', right)
+    (tmp_path / "elsewhere").mkdir()
+    path = tmp_path / "elsewhere" / path.name
+    path.write_text(text)
+    assert len(opened(path).frame_names) == 3
 
 
 @pytest.mark.parametrize("name", ["a\n01.png", "\udcff01.png"])

@@ -250,7 +250,8 @@ def test_patterns_find_what_they_name(tmp_path):
     too_long = "a" * 5000  # no system allows such a name
     assert Search().matching(tmp_path, f"{too_long}/*.png") == Search().matching(tmp_path, too_long) == []
     assert Search().matching(tmp_path, ".left/*.png") == [tmp_path / ".left" / "4.png"]
-    for pattern in ("", "/left/*.png", "left/"):
+    assert Search().matching(tmp_path / "elsewhere", f"{tmp_path}/.left/*.png") == [tmp_path / ".left" / "4.png"]
+    for pattern in ("", "/", "left/"):
         refused("RIL-216", Search().matching, tmp_path, pattern)
 
 

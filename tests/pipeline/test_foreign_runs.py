@@ -22,8 +22,11 @@ from terrain_runs import finished
 from rille.pipeline.api import open_run
 from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
+from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import unpack
+from rille.pipeline.export.programs import rocrate
+from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.export.read_dem import frames_of, read_elevation
 from rille.stages.core.declare import Bundle
 
@@ -245,6 +248,42 @@ def test_a_run_whose_frames_are_none_has_no_cameras(tmp_path: Path, content: str
     folder = finished(tmp_path / "run")
     (folder / "frames.json").write_text(content)
     assert read_elevation(folder).viewpoints is None
+
+
+@pytest.mark.parametrize("text", [DEEP, '{"@graph":' * 50_000, "5", '{"@graph": [5]}', '{"@graph": [{"@id": "#run"}]}'])
+def test_a_crate_that_is_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / rocrate.METADATA).write_text(text)
+    with raises("RIL-023"):
+        rocrate.read(tmp_path)
+
+
+def test_a_crate_of_data_alone_is_no_run(tmp_path: Path) -> None:
+    """Whatever its text mentions."""
+    assert rocrate.read(tmp_path) is None
+    root = {"@id": "./", "@type": "Dataset", "mentions": {"@id": "#run"}}
+    (tmp_path / rocrate.METADATA).write_text(json.dumps({"@graph": [root]}))
+    assert rocrate.read(tmp_path) is None
+
+
+def test_a_crate_takes_no_file_along_that_a_link_names(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("of another folder")
+    (run / "report.json").write_text('{"command": "rille reconstruct seq"}')
+    (run / "dem.tif").symlink_to(tmp_path / "secret")
+    with raises("RIL-723", "dem.tif"):
+        export_run("rocrate", run, run / "crate", Store(run.parents[2] / "cache"))
+    (run / "dem.tif").unlink()
+    (run / "terrain.zarr").mkdir()
+    (run / "terrain.zarr" / "0.0").symlink_to(tmp_path / "secret")
+    with raises("RIL-723", "0.0"):
+        export_run("rocrate", run, run / "crate", Store(run.parents[2] / "cache"))
+    assert not (run / "crate").exists()
+
+
+def test_a_drive_makes_no_crate(run: Path) -> None:
+    (run / "report.json").write_text('{"command": "rille drive mockup-loop"}')
+    with raises("RIL-611", "config.toml"):
+        export_run("rocrate", run, run / "crate", Store(run.parents[2] / "cache"))
+    assert not (run / "crate").exists()
 
 
 def test_a_raster_whose_text_is_not_utf8(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from rille.pipeline.export.programs.run_artifacts import FILES, export_run
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
 
-Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2"]
+Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
 
 
 def export(
@@ -34,7 +34,8 @@ def export(
         laz (CloudCompare, PDAL, QGIS), ply (CloudCompare, MeshLab): every matched pixel as a point with its standard
         deviations; glb: the ground as a mesh, for any glTF viewer, Blender; frames: position, range, normal, slope,
         roughness and disparity of each pair as rasters of its left image; colmap: cameras, rig, poses and tracked
-        points; nav2: occupancy map of ROS 2's navigation.
+        points; nav2: occupancy map of ROS 2's navigation; rocrate: an RO-Crate of all files with digests of results and
+        inputs, parameters, versions and the command, for archives; `rille reconstruct` runs it again.
     output
         What to write; by default cloud.laz, cloud.ply, terrain.glb or a folder of the form's name in the run's folder.
     every

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -96,6 +97,13 @@ class RunArtifacts:
         """Risk map of the world; of a drive, what it knew at its last stop."""
         stops = [int(stop) for stop in self.labels(r"risk/(\d{1,9})")]
         return self.one(f"risk/{max(stops)}" if stops and "risk/world" not in self._rows else "risk/world")
+
+    def digests(self) -> Iterator[tuple[str, str]]:
+        """Label and SHA-256 of each file that a task of the run has read, by its artifact."""
+        for label, row in self._rows.items():
+            made = self._store.manifest(str(row["stage"]), str(row["key"])) if not row.get("inputs") else None
+            args = {} if made is None else made["provenance"]["args"]
+            yield from ((label, value) for value in (args.get("sha256"), *args.get("digests", {}).values()) if value)
 
     def _open(self, label: str) -> Bundle:
         row = self._rows[label]

@@ -226,19 +226,21 @@ def test_an_imu_that_contradicts_the_images_is_warned_of():
     spun = [Rotation.from_rotvec([0.0, 0.2 * k, 0.0]).as_matrix() for k in range(9)]
     known = {"imu_axes": np.eye(3), "times": 0.05 * np.arange(9), "pitch": None, "attitude": spun}
     run.sequence.__dict__.update(known)
-    (rates,) = summary._sensors(run)
+    (rates,) = summary._sensed_turns(run)
+    assert summary._verticals(run) == []
     assert "degrees a second" in rates
     run.products.ground[0].meta["seen_up"] = [0.0, 0.0, -1.0]
     run.sequence.attitude = [np.eye(3)] * 9
-    (gravity,) = summary._sensors(run)
+    (gravity,) = summary._verticals(run)
+    assert summary._sensed_turns(run) == []
     assert "up is 90 degrees off" in gravity
     run.sequence.imu_axes = None
     run.products.ground[0].meta.update(source="pitch")
     run.sequence.pitch = 0.0
-    (pitch,) = summary._sensors(run)
+    (pitch,) = summary._verticals(run)
     assert "looks down by 90 degrees" in pitch
     run.products.ground[0].meta.update(source="none")
-    assert summary._sensors(run) == []
+    assert summary._sensed_turns(run) == summary._verticals(run) == []
 
 
 @pytest.mark.parametrize(("warnings", "told"), [([], 1), (["the truth fits better by another convention"], 0)])
