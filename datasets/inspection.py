@@ -21,7 +21,7 @@ from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import hints, unread
+from rille.datasets.images.kinds import hints, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
@@ -38,8 +38,6 @@ CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
-
-SPLIT = "if each shows both views: ffmpeg -i FILE -vf crop=iw/2:ih:0:0 left/FILE -vf crop=iw/2:ih:iw/2:0 right/FILE"
 
 
 @dataclass(frozen=True)
@@ -206,8 +204,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     both = {key: sides for key, sides in groups.items() if all(sides)}
     frames = {(row, re.sub(r"\d+", "", place)) for row, place in both}
     if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
-        left, right = ([sides[k][0] for sides in both.values()] for k in (0, 1))
-        both = {min(both): (left, right)}
+        alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
+        both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
     if not both and (parts := pairing.by_one_word(names)):
         (first, ours), (second, theirs) = parts.items()
         both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
@@ -216,10 +214,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if not both:
         counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
         remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
-        for path in images[: 0 if any(counts) else 1]:
+        for path in images[: 1 if sum(counts) in (0, len(images)) and not all(counts) else 0]:
             with suppress(InputError):
                 header = common_header([path]).header
-                remedy = f"{SPLIT}; else {remedy}" if header.width >= 2 * header.height else remedy
+                remedy = (
+                    f"{split('each shows', 'FILE')}; else {remedy}" if header.width >= 2 * header.height else remedy
+                )
         text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
@@ -228,7 +228,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     left, right = both[key]
     sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
-        matched = pairing.pair_up(left, right, gaps=True, warnings=lines)  # as the manifest opens
+        matched = pairing.pair_up(left, right, warnings=lines)  # as the manifest opens
         headers, matched = pairing.common_headers(matched)
         sizes = sizes_of(headers)
     except InputError as error:

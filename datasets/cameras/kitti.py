@@ -21,8 +21,8 @@ from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.lens import Lens
 
-PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d\d)")
-LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d\d)[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
+PROJECTION = re.compile(r"P(\d)(?:_roi)?|P_rect_(\d{2,3})")
+LINE = re.compile(r"^[ \t]*(P\d(?:_roi)?|P_rect_\d{2,3})[ \t]*:[ \t]*[-+.\d]", re.MULTILINE)
 """A label and its first number, unlike the `P1` of OpenCV's YAML, a matrix or a list in brackets."""
 
 LEAST_FOCAL = 2.0
@@ -57,7 +57,7 @@ def kitti(text: str, path: Path) -> list[CalibratedCamera]:
     labels = sorted(label for label in fields.values if PROJECTION.fullmatch(label))
     if any(label.endswith("_roi") for label in labels):  # of the part that the images show
         labels = [label for label in labels if label.endswith("_roi")]
-    fields.used |= {f"D_{label[-2:]}" for label in labels}  # of the images before they were rectified
+    fields.used |= {f"D_{label.rpartition('_')[2]}" for label in labels}  # of the images before they were rectified
     fields.check_lens()
     return [_rectified(fields, label) for label in labels]
 

@@ -1,11 +1,13 @@
 """Calibrations of stereo cameras and data sets by their makers.
 
-ZED's ``.conf``, OAK's JSON (DepthAI), ``K.txt``, Middlebury's rectified pairs (2014 and 2021), and figures by key.
+ZED's ``.conf``, OAK's JSON (DepthAI), RealSense's list, ``K.txt``, Middlebury's rectified pairs (2014 and 2021), and
+figures by key.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +16,9 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
+from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
+from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
@@ -34,6 +38,13 @@ ZED_SIZES = {
     "4K": (3840, 2160),
 }
 """Pixels of the resolutions in a ``.conf``."""
+
+
+GROUP = re.compile(r"(in|ex)trinsics?")
+TURN = re.compile(
+    r"R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|T_(right_left|left_right)|toe_?in\w*", re.I
+)
+"""In a file of figures by key: parts with entries of their own, and keys that say how one camera is turned."""
 
 
 def zed(text: str, path: Path) -> list[CalibratedCamera]:
@@ -117,6 +128,28 @@ def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
     return socket, T
 
 
+INFRARED = re.compile(r'Intrinsic of[ \t]+"Infrared ([12])".*\n((?:[ \t]*[A-Z]\w+[^:\n]*:.*\n?)+)')
+RELATIVE = re.compile(r'from[ \t]+"Infrared 1"[ \t]+To[ \t]+"Infrared 2"[^-\d]*([-+.\de\s]+)Translation[^:]*:([^\n]*)')
+"""Of a RealSense's list: an infrared camera with its entries, and R and T of ``x_right = R x_left + T``, metres."""
+
+
+def realsense(text: str, path: Path) -> list[CalibratedCamera]:
+    """The infrared cameras at each resolution, as ``rs-enumerate-devices -c`` prints them."""
+    cameras = {}
+    placed = RELATIVE.search(text)
+    R, T = (part.split() for part in placed.groups()) if placed else (None, None)
+    for number, body in INFRARED.findall(text):
+        rows = ((key.lower(), value.split()) for key, value in re.findall(r"(\w+)[^:\n]*:(.*)", body))
+        stated = {key: row if key == "coeffs" else " ".join(row) for key, row in rows}
+        f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
+        camera = f.optics("fx fy ppx ppy", "none", "", f.size("width", "height")).camera
+        pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
+        cameras[number, camera.width, camera.height] = CalibratedCamera(
+            f"Infrared {number}", f.distorted("coeffs", camera), pose
+        )
+    return list(cameras.values())
+
+
 def numbers_of_matrix(text: str) -> list[str]:
     """The nine numbers fx 0 cx, 0 fy cy, 0 0 1 of a text, and perhaps a tenth; empty for any other text."""
     words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
@@ -135,26 +168,49 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     return figures(Fields(values, str(path)), path)
 
 
+def _flat(f: Fields) -> Fields:
+    """Entries with those of the parts ``intrinsic`` and ``extrinsic`` (or in plural) among them."""
+    parts = {key: value for key, value in f.values.items() if GROUP.fullmatch(key) and isinstance(value, Mapping)}
+    flat = {key: value for part in parts.values() for key, value in part.items()}
+    return Fields({**{k: v for k, v in f.values.items() if k not in parts}, **flat}, f.file, f.at, f.used)
+
+
 def _parts(f: Fields) -> list[Fields]:
     """Entries of the left and of the right camera, or those of the file, which are of one camera."""
-    sides = [f.sub(side) for side in CAMERAS if isinstance(f.values.get(side), dict)]
-    return [side for side in sides if "fx" in side] or [f]
+    names = next(iter(two_sides(key for key, value in f.values.items() if isinstance(value, Mapping))), ())
+    return [part for name in names if "fx" in (part := _flat(f.sub(name)))] or [_flat(f)]
+
+
+def _centre(part: Fields) -> str:
+    """Keys of the principal point: those of RealSense, of Cityscapes, or the usual ones."""
+    return next((keys for keys in ("ppx ppy", "u0 v0") if keys.split()[0] in part), "cx cy")
 
 
 def has_figures(f: Fields) -> bool:
-    """Whether there are fx, fy, cx and cy (RealSense: ppx and ppy) of one camera, or of ``left`` and ``right``."""
-    return all("fx" in part and "fy" in part and ("cx" in part or "ppx" in part) for part in _parts(f))
+    """Whether there are fx, fy, and the principal point of one camera, or of ``left`` and ``right``."""
+    return all(key in part for part in _parts(f) for key in ("fx", "fy", _centre(part).split()[0]))
 
 
 def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Cameras of a file with a number for each key, as scripts write it; parallel, with ``baseline``, metres."""
+    """Cameras of a file with a number for each key, as scripts write it (Cityscapes' ``camera.json``, too).
+
+    ``x_right = R x_left + T``, metres; with ``baseline`` alone the cameras are parallel.
+    """
     lenses = []
     for part in _parts(f):
-        pinhole, fisheye = "fx fy ppx ppy" if "ppx" in part else "fx fy cx cy", part.model("k1") == "fisheye"
+        fisheye = part.model("k1") == "fisheye"
         model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("radtan", "k1 k2 p1 p2 k3")
-        lenses.append(part.optics(pinhole, model, keys, part.size("width", "height")))
-    if "baseline" in f:
-        return stereo_cameras(lenses[0], lenses[-1], parallel(f.number("baseline")))
+        lenses.append(part.optics(f"fx fy {_centre(part)}", model, keys, part.size("width", "height")))
+    rig = _flat(f)
+    T_right_left = relative(rig)
+    if T_right_left is None and "baseline" in rig:
+        T_right_left = parallel(rig.number("baseline"))
+    for key in rig.values:
+        if TURN.fullmatch(key) and key not in rig.used:
+            remedy = "state it as R, a 3 x 3 matrix, with T (m), x_right = R x_left + T; or remove it"
+            raise rig.error("RIL-766", key, "seems to turn a camera, and is not read there", remedy)
+    if T_right_left is not None:
+        return stereo_cameras(lenses[0], lenses[-1], T_right_left)
     names = CAMERAS if lenses[1:] else [path.stem]
     return [CalibratedCamera(name, lens) for name, lens in zip(names, lenses, strict=True)]
 

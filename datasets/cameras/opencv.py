@@ -29,8 +29,19 @@ MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectifica
 """Fields of ROS' message camera_info (small letters in ROS 2), and keys of its files."""
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
-ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix"), ("T", "translation_vector")
+ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix", "rotation"), ("T", "translation_vector", "translation")
 POSE = (*ROTATIONS, *TRANSLATIONS)
+
+OST = re.compile(r"^\[?([a-z][\w/ ]*)\]?[ \t]*\n((?:[ \t]*[-+.\d].*\n?|[ \t]*\n)*)", re.MULTILINE)
+OST_KEYS = {
+    "width": "image_width",
+    "height": "image_height",
+    "camera matrix": "camera_matrix",
+    "distortion": "distortion_coefficients",
+    "rectification": "rectification_matrix",
+    "projection": "projection_matrix",
+}
+"""Of a text of ROS's camera_calibrator: a heading with the numbers below it; and the keys of the same in its YAML."""
 
 
 def sides(f: Fields) -> list[tuple[str, str]]:
@@ -62,8 +73,7 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
     elif placed.has(*POSE):
-        T_right_left = placed.transform(placed.spelt(ROTATIONS), placed.spelt(TRANSLATIONS))
-        poses = RigidTransform.identity(), T_right_left
+        poses = RigidTransform.identity(), relative(placed)
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
     return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
@@ -132,6 +142,17 @@ def single(f: Fields, path: Path) -> list[CalibratedCamera]:
     return [replace(whole, lens=_read_out(f, whole.lens), rectified=rectified)]
 
 
+def ost(text: str, path: Path) -> list[CalibratedCamera]:
+    """Cameras of ROS's camera_calibrator as it prints them (``ost.txt``, ``.ini``), one after the other."""
+    cameras = []
+    for part in text.split("[image]")[1:]:
+        rows = {OST_KEYS.get(heading, heading): numbers.split() for heading, numbers in OST.findall(part)}
+        entries = {key: row if row[1:] else row[0] for key, row in rows.items() if row}
+        name = next((heading for heading, row in rows.items() if not row), path.stem)
+        cameras += single(Fields({"camera_matrix": None, **entries, "camera_name": name}, f"{path} {name}"), path)
+    return cameras
+
+
 def _read_out(f: Fields, lens: Lens) -> Lens:
     """The lens of images that show a part of the sensor, or combine several of its pixels (ROS' roi and binning).
 
@@ -153,6 +174,11 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
         if key in f:
             return f.pair_of_pixels(key)
     return f.size(f.spelt(WIDTHS), f.spelt(HEIGHTS))
+
+
+def relative(f: Fields) -> RigidTransform | None:
+    """T_right_left of R and T; None if there is neither."""
+    return f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS)) if f.has(*POSE) else None
 
 
 def _beside(path: Path) -> Fields | None:

@@ -8,10 +8,18 @@ from pathlib import PurePath
 
 from rille.datasets.text.count import count
 
+
+def split(what: str, name: str) -> str:
+    """How to take apart a file FILE in which both views stand side by side; ``name``: of each half."""
+    halves = (f"-vf crop=iw/2:ih:{left}:0 {side}/{name}" for side, left in (("left", "0"), ("right", "iw/2")))
+    return f"if {what} both views: mkdir left right; ffmpeg -i FILE {' '.join(halves)}"
+
+
 KINDS: dict[str, tuple[str, str]] = {
     "video": (
         ".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .mjpeg .h264 .h265 .hevc",
-        "take its images out, a folder a camera: mkdir left; ffmpeg -i FILE left/%06d.png",
+        "take its images out, a folder a camera: mkdir left; ffmpeg -i FILE left/%06d.png; "
+        + split("it shows", "%06d.png"),
     ),
     "stereo image": (
         ".mpo .jps .pns",

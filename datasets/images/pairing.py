@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -222,12 +223,18 @@ def without_side(stem: str, side: int) -> str:
     return found[2] if found is not None and found[1] == side else stem
 
 
+def _told_apart(left: Sequence[Path], right: Sequence[Path], part: Callable[[Path], str]) -> dict[Path, str]:
+    """A part of each path without its side's token; whole if images of both sides have one: it tells no side then."""
+    shared = set(map(part, left)) & set(map(part, right))
+    sides = [(path, side) for side, paths in enumerate((left, right)) for path in paths]
+    return {path: part(path) if shared else without_side(part(path), side) for path, side in sides}
+
+
 def pair_up(
     left: Sequence[Path],
     right: Sequence[Path],
     rule: str = "auto",
     *,
-    gaps: bool = False,
     growing: bool = False,
     tolerance: float | None = None,
     warnings: list[str] | None = None,
@@ -237,12 +244,11 @@ def pair_up(
     Parameters
     ----------
     left, right : image files of each camera.
-    rule : ``name`` (equal stems, sides' tokens aside), ``number`` (the last number in the stem by which all differ),
-        ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted names), or ``auto``: name; nearest
-        where time stamps differ, number where the names of the two cameras have nothing in common, and the folder
-        where each frame has its own and all files of a camera have one name.
-    gaps : images that are paired by name and have no partner make a pair with an absent file, as long as they are
-        fewer than the whole pairs.
+    rule : ``name`` (equal stems, sides' tokens aside), ``folder`` (those of their folders), ``number`` (the last number
+        in the stem by which all differ), ``nearest`` (time stamps in the stems, see :func:`join`), ``order`` (sorted
+        names), or ``auto``: folder where all files of a camera have one name, else name; nearest where time stamps
+        differ, number where the names of the two cameras have nothing in common. Images that are paired by name or
+        folder and have no partner make a pair with an absent file, as long as they are fewer than the whole pairs.
     growing : images after the last pair, by name or number, are left out, since their partners are still to come.
     tolerance : s; largest difference of the stamps of a pair; None: see :func:`join`.
     warnings : takes lines on images that are left out or not simultaneous.
@@ -253,23 +259,22 @@ def pair_up(
         An image has no partner, two images make the same pair, the counts differ, or stamps of a pair are apart.
     """
     lines = [] if warnings is None else warnings
-    left, right = (_sorted(paths, side) for side, paths in enumerate((left, right)))
-    if _begun_anew(_ascending([without_side(path.stem, 0) for path in left])):
+    names = _told_apart(left, right, lambda path: path.stem)
+    left, right = (_sorted(paths, names) for paths in (left, right))
+    if _begun_anew(_ascending([names[path] for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
-    times = _times(left), _times(right)
-    joined = join(*times, tolerance) if all(times) else None
+    joined = join(*times, tolerance) if all(times := (_times(left), _times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
-    # One image each is a pair, whatever their names.
-    if rule == "order" or (rule == "auto" and len(left) == len(right) == 1):
+    rule = rule if rule != "auto" else _fitting(left, right, names, joined)
+    if rule == "order":
         if len(left) != len(right):
             remedy = "remove what is too many, or pair by name or number"
             raise IncompleteError("RIL-256", f"{both} cannot be paired by order", remedy=remedy)
         pairs = _named(list(zip(left, right, strict=True)))
-        lines += _two_clocks(pairs, *times, tolerance) if all(times) and len(pairs) > 1 else []
+        lines += _two_clocks(pairs, *times, tolerance) if joined is not None and len(pairs) > 1 else []
         return pairs
-    shared = {without_side(path.stem, 0) for path in left} & {without_side(path.stem, 1) for path in right}
-    if rule == "nearest" or (rule == "auto" and joined is not None and (joined.apart or not shared)):
+    if rule == "nearest":
         if joined is None or not joined.places:
             why = f"the nearest are {joined.apart:.4g} s apart" if joined else "not each has its own"
             remedy = 'state images.tolerance (s), or, of two clocks, images.pair = "order"'
@@ -277,17 +282,15 @@ def pair_up(
             raise IncompleteError("RIL-822", text, remedy=remedy)
         lines += joined.lines("RIL-821")
         return _named([(left[i], right[j]) for i, j in joined.places])
-    rule = rule if rule != "auto" else "name" if shared else "number"
-    by_key = _by_folder(left, 0), _by_folder(right, 1)
-    if [len(of) for of in by_key] == [len(left), len(right)]:
-        rule = "folder"
-    else:
-        by_key = _by_key(left, 0, rule), _by_key(right, 1, rule)
+    root = Path(os.path.commonpath([path.parent.absolute() for path in (*left, *right)]))
+    if rule == "folder":
+        names = _told_apart(left, right, lambda path: _compared(path, rule, root))
+    by_key = _by_key(left, rule, names), _by_key(right, rule, names)
     if growing:
         by_key = _up_to_last_pair(*by_key)
     shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
-    if gaps and rule == "name" and 2 * len(shared) > len(present):
-        return _with_gaps(by_key)
+    if rule != "number" and 2 * len(shared) > len(present):
+        return _with_gaps(by_key, rule, root)
     alone = [path for ours in by_key for key, path in ours.items() if key not in shared]
     if alone:
         more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
@@ -297,20 +300,31 @@ def pair_up(
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
 
-def _sorted(paths: Sequence[Path], side: int) -> list[Path]:
-    stems = in_order([without_side(path.stem, side) for path in paths])
-    place = {stem: k for k, stem in enumerate(stems)}
-    return sorted(paths, key=lambda path: (place[without_side(path.stem, side)], natural(path.name)))
+def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, str], joined: TimedPairs | None) -> str:
+    """The rule by which images are paired if none is stated."""
+    # One image each is a pair, whatever their names.
+    if len(left) == len(right) == 1:
+        return "order"
+    if len({path.name for path in left}) == len({path.name for path in right}) == 1:
+        return "folder"
+    shared = {names[path] for path in left} & {names[path] for path in right}
+    if joined is not None and (joined.apart or not shared):
+        return "nearest"
+    return "name" if shared else "number"
 
 
-def _by_folder(paths: Sequence[Path], side: int) -> dict[str, Path]:
-    """Images by their folder without the side's token, where each frame has its own and all have one name."""
-    places = {without_side(path.parent.as_posix(), side): path for path in sorted(paths, key=lambda p: natural(str(p)))}
-    return places if len({path.name for path in paths}) == 1 < len(paths) else {}
+def _sorted(paths: Sequence[Path], names: Mapping[Path, str]) -> list[Path]:
+    place = {name: k for k, name in enumerate(in_order([names[path] for path in paths]))}
+    return sorted(paths, key=lambda path: (place[names[path]], natural(str(path))))
 
 
-def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
-    """Images by the key of a pair: the name without the side's token, or its number."""
+def _compared(path: Path, rule: str, root: Path) -> str:
+    """The part of a path that a rule compares: its folder below ``root``, which all images share, or its name."""
+    return os.path.relpath(path.parent, root) if rule == "folder" else path.stem
+
+
+def _by_key(paths: Sequence[Path], rule: str, names: Mapping[Path, str]) -> dict[str, Path]:
+    """Images by the key of a pair: the number in the file's name, or what ``names`` says."""
     by_key: dict[str, Path] = {}
     found = [re.findall(r"\d+", path.stem)[::-1] for path in paths]
     # The last number that no two names share; a later one may be that of the camera, or of a file's version.
@@ -320,7 +334,7 @@ def _by_key(paths: Sequence[Path], side: int, rule: str) -> dict[str, Path]:
             text = f"{path} has no number in its name and no partner of its name"
             remedy = 'rename the images, or narrow the patterns; a manifest may take them by images.pair = "order"'
             raise InputError("RIL-257", text, remedy=remedy)
-        key = str(int(numbers[last])) if rule == "number" else without_side(path.stem, side)
+        key = str(int(numbers[last])) if rule == "number" else names[path]
         if key in by_key:
             text = f"{by_key[key]} and {path} are the same frame by {rule}"
             raise InputError("RIL-258", text, remedy="narrow the patterns, or choose another images.pair")
@@ -362,15 +376,15 @@ def _two_clocks(
     return [warning("RIL-824", text)] if abs(offset) > MOST_APART else []
 
 
-def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]]) -> tuple[ImagePair, ...]:
+def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]], rule: str, root: Path) -> tuple[ImagePair, ...]:
     """Pairs of all keys and of missing numbers of a running count; an absent file has its expected name."""
     whole = next(key for key in by_key[0] if key in by_key[1])
     keys = counted(in_order(list({**by_key[0], **by_key[1]})))
-    paths = [[ours.get(key) or _called(ours[whole], whole, key) for ours in by_key] for key in keys]
+    paths = [[ours.get(key) or _called(ours[whole], whole, key, rule, root) for ours in by_key] for key in keys]
     pairs = []
     for key, pair in zip(keys, _named([(left, right) for left, right in paths]), strict=True):
         gone = [path for path, ours in zip((pair.left, pair.right), by_key, strict=True) if key not in ours]
-        words = " and ".join(f"{path.parent.name}/{path.name}" for path in gone)
+        words = " and ".join(os.path.relpath(path, root) for path in gone)
         pairs.append(replace(pair, absent=f"{words} {'are' if gone[1:] else 'is'} missing" if gone else ""))
     return tuple(pairs)
 
@@ -386,11 +400,11 @@ def counted(names: list[str]) -> list[str]:
     return [by_number.get(k, f"{k:0{len(names[0])}d}") for k in range(numbers[0], numbers[-1] + 1)]
 
 
-def _called(example: Path, key: str, wanted: str) -> Path:
+def _called(example: Path, key: str, wanted: str, rule: str, root: Path) -> Path:
     """File of another key, named as ``example``, whose key is ``key``: its side's token for the asterisk."""
-    before, star, behind = key.partition("*")
-    token = example.stem[len(before) : len(example.stem) - len(behind)] if star else ""
-    return example.with_name(wanted.replace("*", token) + example.suffix)
+    found = re.fullmatch(re.escape(key).replace(r"\*", "(.*?)"), _compared(example, rule, root))
+    name = wanted.replace("*", found[1] if found and found.groups() else "")
+    return root / name / example.name if rule == "folder" else example.with_name(name + example.suffix)
 
 
 def _named(pairs: list[tuple[Path, Path]]) -> tuple[ImagePair, ...]:

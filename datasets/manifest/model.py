@@ -62,9 +62,9 @@ class Images(Table):
     left : folder of the left images below the root, or their pattern, e.g. left/*.png; ** is any folder; or BAG, or
         BAG:TOPIC.
     right : that of the right images, or the same bag.
-    pair : how images are paired: by name (left/right aside), by the last number in the name, by the nearest time stamp
-        in it, or by order; auto: by name, by time stamps where these differ, else by number; by folder where each frame
-        has its own.
+    pair : how images are paired: by name (left/right aside), by that of their folder, by the last number in the name,
+        by the nearest time stamp in it, or by order; auto: by folder where each frame has its own, by name, by time
+        stamps where these differ, else by number.
     tolerance : s; time between the images of a pair at most, by the stamps in their names; by default a quarter of the
         usual interval, at most 0.01.
     rectified : whether the images are rectified; by default they are where a word of their folders' or files' names
@@ -73,7 +73,7 @@ class Images(Table):
 
     left: str
     right: str
-    pair: Literal["auto", "name", "number", "nearest", "order"] = "auto"
+    pair: Literal["auto", "name", "folder", "number", "nearest", "order"] = "auto"
     tolerance: float | None = Field(default=None, gt=0)
     rectified: bool | None = None
 
@@ -158,7 +158,8 @@ class RigSection(Table):
 
     Attributes
     ----------
-    baseline : m; the right camera stands that far along the left one's x axis.
+    baseline : m; distance of the cameras. Beside calibration files that say how the cameras stand to each other it
+        replaces the distance alone; otherwise the right camera stands that far along the left one's x axis.
     T_right_left : rows of [R | t], m: x_right = R x_left + t.
     file : rig that `rille rig` has estimated; its relative orientation is used as it is, with rig.mode fixed.
     unit : m; length of one unit of the calibration files, 0.001 where they say mm; 1 lets a baseline exceed 20 m.

@@ -225,7 +225,6 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
         found["left"],
         found["right"],
         images.pair,
-        gaps=True,
         growing=digests.growing,
         tolerance=images.tolerance,
         warnings=lines,

@@ -69,8 +69,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     above = manifest.world.up
     up = None if above is None else direction(above, left.T_camera_reference)
     pinned = None if manifest.rig.file is None else _pinned(root / manifest.rig.file)
-    stated = _stated(manifest.rig) if pinned is None else pinned.T_right_left
-    left, right, lines = _placed(left, right, stated)
+    left, right, lines = _placed(left, right, manifest.rig, pinned)
     rig, lenses = rig_of(left, right, sizes)
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
@@ -164,12 +163,13 @@ def direction(stated: Vector, T_camera_reference: RigidTransform | None) -> Vect
 
 
 def _placed(
-    left: CalibratedCamera, right: CalibratedCamera, stated: RigidTransform | None
+    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame, by the manifest, else by the files; and warnings."""
     of_files = None
     if left.T_camera_reference is not None and right.T_camera_reference is not None:
         of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
+    stated = _stated(section, of_files) if pinned is None else pinned.T_right_left
     if stated is None and of_files is None:
         text = "the rig is not known: nothing says where the right camera stands"
         remedy = "give rig.baseline (m; parallel cameras) or rig.T_right_left, or calibration files that have it"
@@ -196,10 +196,16 @@ def _pinned(path: Path) -> Rig:
         raise InputError("RIL-022", text, remedy="`rille rig RUN ... -o rig.toml` writes one") from error
 
 
-def _stated(section: RigSection) -> RigidTransform | None:
+def _stated(section: RigSection, of_files: RigidTransform | None) -> RigidTransform | None:
+    """T_right_left of the manifest, whose baseline replaces the length of that of the files alone."""
     if section.T_right_left is not None:
         return section.T_right_left
-    return None if section.baseline is None else parallel(section.baseline)
+    if section.baseline is None:
+        return None
+    if of_files is None or not of_files.translation.any():
+        return parallel(section.baseline)
+    length = float(np.linalg.norm(of_files.translation))
+    return RigidTransform(of_files.rotation, of_files.translation * (section.baseline / length))
 
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:

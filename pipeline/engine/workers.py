@@ -11,6 +11,7 @@ loopback with keys of this run alone, because whoever reaches a scheduler of das
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import inspect
 import itertools
@@ -134,7 +135,7 @@ def check(kind: Any, jobs: int | None = None) -> None:
     ------
     ConfigError
         It is neither one of the kinds nor an address nor an open ``Client`` of dask, or there are no ``jobs``; or this
-        process is a worker that imports its program, may start no workers, or was forked after a run.
+        process runs a program whose workers would run it again, may start no workers, or was forked after a run.
     """
     if not isinstance(kind, str):
         from distributed import Client
@@ -145,10 +146,8 @@ def check(kind: Any, jobs: int | None = None) -> None:
             raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
     elif kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
         raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
-    # A spawned worker imports the program's main module first: without a guard it would start workers of its own.
-    at_work = {frame.f_globals.get("__name__") for frame, _ in traceback.walk_stack(inspect.currentframe())}
-    if kind == "dask" and multiprocessing.parent_process() is None and "__mp_main__" in at_work:
-        text = "a worker that starts came to this call"
+    if kind == "dask" and (where := _unguarded()):
+        text = f"{where} runs whenever the program is imported, which each worker does that starts"
         raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
     # One of multiprocessing's pools, or of another cluster of dask: Python lets no daemon start processes.
     if kind == "dask" and multiprocessing.current_process().daemon:
@@ -159,6 +158,21 @@ def check(kind: Any, jobs: int | None = None) -> None:
         raise ConfigError("RIL-543", text, remedy='start it by multiprocessing.get_context("spawn")')
     if jobs is not None and jobs < 1:
         raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
+
+
+def _unguarded() -> str:
+    """Place in the program from which this is called, if a spawned worker, which imports the program, comes there, too;
+    empty if a guard keeps it away."""
+    for frame, line in traceback.walk_stack(inspect.currentframe()):
+        if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") in ("__main__", "__mp_main__"):
+            file = frame.f_code.co_filename
+            try:
+                statements = ast.parse(Path(file).read_bytes()).body
+            except (OSError, SyntaxError, ValueError):  # of an interactive Python there is no file
+                return ""
+            here = [ast.unparse(one) for one in statements if one.lineno <= line <= (one.end_lineno or 0)]
+            return "" if any("__name__" in statement for statement in here) else f"line {line} of {file}"
+    return ""
 
 
 @cache

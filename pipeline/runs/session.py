@@ -313,7 +313,7 @@ def _make_folder(parent: Path, started: datetime) -> Path:
         folder.mkdir(parents=True)
     except OSError as error:
         text = f"cannot make {folder}: {reason_of(error)}"
-        raise RilleError("RIL-061", text, remedy="choose another --runs folder") from error
+        raise ConfigError("RIL-061", text, remedy="choose another --runs folder") from error
     return folder
 
 

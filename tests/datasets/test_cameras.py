@@ -575,9 +575,75 @@ def test_figures_without_a_baseline_are_cameras_and_an_unread_lens_is_refused(tm
         read_cameras(written(tmp_path, json.dumps({"left": real, "right": real})))
 
 
+@pytest.mark.parametrize("placed", [{"R": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "T": [-0.12, 0, 0]}, {"baseline": 0.12}])
+@pytest.mark.parametrize("group", [False, True])
+def test_figures_with_a_pose(tmp_path, placed, group):
+    camera = {"fx": 460.0, "fy": 461.0, "u0": 363.0, "v0": 248.0}  # Cityscapes' camera.json has both groups
+    stated = {"extrinsic": placed | {"yaw": 0.02}, "intrinsic": camera} if group else camera | placed
+    rig, _ = rig_of(*read_cameras(written(tmp_path, json.dumps(stated), "camera.json")), ((752, 480), (752, 480)))
+    assert (rig.left.cx, rig.right.fy, rig.baseline) == (363.0, 461.0, 0.12)
+    np.testing.assert_allclose(rig.T_right_left.rotation, placed.get("R", np.eye(3)))
+
+
+@pytest.mark.parametrize("turned", [{"rvec": [0, 0.1, 0]}, {"toe_in_deg": 3}, {"extrinsics": [0, 0.1, 0]}])
+def test_a_rotation_that_is_not_read_is_refused(tmp_path, turned):
+    with raises("RIL-766", *turned):
+        read_cameras(written(tmp_path, json.dumps(FIGURES | {"baseline": 0.12} | turned)))
+    with raises("RIL-116", "rotation"):
+        read_cameras(written(tmp_path, json.dumps(FIGURES | {"rotation": [0, 0.1, 0], "translation": [-0.12, 0, 0]})))
+
+
+def test_a_realsense(tmp_path):
+    def camera(number, width, height):
+        figures = f"PPX: \t{width / 2}\n  PPY: \t{height / 2}\n  Fx: \t{width / 2}\n  Fy: \t{width / 2}"
+        lens = "Distortion: \tBrown Conrady\n  Coeffs: \t0  \t0  \t0  \t0  \t0  \n  FOV (deg): \t89.9 x 58.9"
+        head = f'Intrinsic of "Infrared {number}" / {width}x{height} / {{Y8}}'
+        return f" {head}\n  Width: \t{width}\n  Height: \t{height}\n  {figures}\n  {lens}\n\n"
+
+    text = "Device info:\n    Name : \tIntel RealSense D435I\n\nIntrinsic Parameters:\n\n"
+    text += "".join(camera(n, *size) for n in (1, 2) for size in ((848, 480), (640, 480), (640, 480)))
+    for name, first in (("Depth", -0.015), ("Infrared 2", -0.0499)):
+        text += f'Extrinsic from "Infrared 1"\t  To\t  "{name}" :\n Rotation Matrix:\n'
+        text += f"   1   0   0   \n   0   1   0   \n   0   0   1   \n\n Translation Vector: {first}  0  0  \n\n"
+    cameras = read_cameras(written(tmp_path, text, "realsense.txt"))
+    assert [(c.name, c.size) for c in cameras] == [
+        (f"Infrared {n}", size) for n in (1, 2) for size in ((848, 480), (640, 480))
+    ]
+    rig, lenses = rig_of(cameras[1], cameras[3])
+    assert (rig.left, rig.baseline, lenses) == (Camera(320, 320, 320, 240, 640, 480), 0.0499, None)
+
+
+def test_both_cameras_as_camera_calibrator_prints_them(tmp_path):
+    def camera(side, shift):
+        k, p = (
+            "481.2 0.0 320.5\n0.0 481.1 240.5\n0.0 0.0 1.0",
+            f"460.0 0.0 320.5 {shift}\n0.0 460.0 240.5 0.0\n0.0 0.0 1.0 0.0",
+        )
+        head = f"# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n640\n\nheight\n480\n\n[narrow_stereo/{side}]\n\n"
+        matrices = (
+            f"camera matrix\n{k}\n\ndistortion\n0.1 -0.3 -0.001 0.0 0.0\n\nrectification\n1 0 0\n0 1 0\n0 0 1\n\n"
+        )
+        return f"{head}{matrices}projection\n{p}\n\n"
+
+    cameras = read_cameras(written(tmp_path, camera("left", 0.0) + camera("right", -46.0), "ost.txt"))
+    assert [(c.name, c.size) for c in cameras] == [(f"narrow_stereo/{side}", (640, 480)) for side in ("left", "right")]
+    assert cameras[0].lens == Lens(Camera(481.2, 481.1, 320.5, 240.5, 640, 480), "radtan", (0.1, -0.3, -0.001, 0, 0))
+    np.testing.assert_allclose(centre(cameras[1].T_camera_reference), [0.1, 0, 0])
+    with raises("RIL-113", "image_height is missing"):
+        read_cameras(written(tmp_path, "[image]\n\nwidth\n640\n\n[left]\ncamera matrix\n1 0 2\n"))
+
+
+def test_labels_of_drivingstereo(tmp_path):
+    rows = {"K_101": "1 0 9 0 1 5 0 0 1", "D_101": "-0.1 0.1 0 0 0", "S_rect_101": "1762 800"}
+    rows |= {f"P_rect_{n}": f"2063 0 978 {t} 0 2063 544 0 0 0 1 0" for n, t in ((101, 0), (103, -1031.5))}
+    left, right = read_cameras(written(tmp_path, "".join(f"{k}: {v}\n" for k, v in rows.items()), "calib.txt"))
+    assert (left.name, left.size, right.name) == ("P_rect_101", (1762, 800), "P_rect_103")
+    np.testing.assert_allclose(centre(right.T_camera_reference), [0.5, 0, 0])
+
+
 def test_an_ini_file_is_no_camera(tmp_path):
     with raises("RIL-100"):
-        read_cameras(written(tmp_path, "# oST version 5.0\n\n[image]\n\nwidth\n640\n\n[left]\ncamera matrix\n1 0 2\n"))
+        read_cameras(written(tmp_path, "# of a program\n\n[image]\n\nwidth\n640\n"))
 
 
 @pytest.mark.parametrize("bf", [226.746, -226.746])

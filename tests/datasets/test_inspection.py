@@ -94,9 +94,11 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
     for k, pair in zip((9, 10, 11), pairs, strict=True):
         places = [path.relative_to(tmp_path).as_posix() for path in (pair.left, pair.right)]
         assert places == [name.format(k=k, side=side) for side in ("left", "right")]
-    (tmp_path / name.format(k=10, side="right")).unlink()
-    with raises("RIL-259", "folder"):
-        open_sequence(str(tmp_path / "m.toml"))
+    lost = name.format(k=10, side="right")
+    (tmp_path / lost).unlink()
+    assert open_sequence(str(tmp_path / "m.toml")).lost == {1: f"{lost} is missing"}
+    views = inspect(tmp_path).views
+    assert (views.pairs, views.absent) == (3, (f"{lost} is missing",))
 
 
 @pytest.mark.parametrize(
@@ -534,7 +536,8 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
 @pytest.mark.parametrize(
     ("files", "step"),
     [
-        (["left.mp4", "right.mp4"], "ffmpeg"),
+        (["left.mp4", "right.mp4"], "ffmpeg -i FILE left/%06d.png"),
+        (["drive.mp4"], "if it shows both views: mkdir left right; ffmpeg"),
         (["left/1.npy", "right/1.npy"], "cv2.imwrite"),
         (["left/1.webp", "right/1.webp"], "magick mogrify"),
     ],
@@ -622,9 +625,10 @@ def test_pairing_by_time_stamps_is_proposed(tmp_path):
     assert any("1 image without a partner" in line for line in sequence.warnings)
 
 
-def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path):
-    write_images(tmp_path / "wide", ["1.png", "2.png"], (128, 48))
-    with raises("RIL-194", "if each shows both views: ffmpeg"):
+@pytest.mark.parametrize("place", ["", "left/"])  # those of a video that was taken apart as a left camera's
+def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path, place):
+    write_images(tmp_path / "wide", [f"{place}1.png", f"{place}2.png"], (128, 48))
+    with raises("RIL-194", "if each shows both views: mkdir left right; ffmpeg"):
         inspect(tmp_path / "wide")
     write_images(tmp_path / "one", ["1.png"])
     with pytest.raises(InputError) as caught:

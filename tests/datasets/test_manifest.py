@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -182,6 +183,16 @@ def test_another_baseline_than_that_of_the_calibration_is_told(tmp_path, baselin
     s = opened(write_sequence(tmp_path, cameras=cameras, rig=f"[rig]\nbaseline = {baseline}\n"))
     assert s.rig.baseline == pytest.approx(baseline)
     assert any("RIL-693" in line for line in s.warnings) == told
+
+
+def test_a_baseline_beside_a_calibration_that_turns_a_camera_replaces_its_length_alone(tmp_path):
+    R = rotation_exp([0.01, 0.05, 0.0])
+    camera = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "R": R.tolist(), "T": [-200.0, 3.0, 0.0]}  # mm
+    (tmp_path / "rig.json").write_text(json.dumps(camera))
+    s = opened(write_sequence(tmp_path, cameras='[cameras]\nfile = "rig.json"\n', rig="[rig]\nbaseline = 0.2\n"))
+    assert s.rig.baseline == pytest.approx(0.2)
+    np.testing.assert_allclose(s.rig.T_right_left.rotation, R, atol=1e-9)
+    np.testing.assert_allclose(s.rig.T_right_left.translation[1] / s.rig.T_right_left.translation[0], -0.015)
 
 
 def test_a_distortion_without_projection_is_refused(tmp_path):

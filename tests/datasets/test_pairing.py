@@ -30,10 +30,9 @@ def found(left: list[Path], right: list[Path], rule: str = "auto") -> list[tuple
         ["image", "image (2)", "image (10)"],
     ],
 )
-@pytest.mark.parametrize("gaps", [False, True])
-def test_pairs_stand_in_the_order_of_the_decimals_in_their_names(names, gaps):
+def test_pairs_stand_in_the_order_of_the_decimals_in_their_names(names):
     sides = [paths(*(f"{side}/{name}.png" for name in random.Random(3).sample(names, len(names)))) for side in "lr"]
-    assert [pair.name for pair in pair_up(*sides, gaps=gaps)] == names
+    assert [pair.name for pair in pair_up(*sides)] == names
 
 
 @pytest.mark.parametrize(
@@ -85,13 +84,48 @@ def test_what_has_no_partner_is_named(left, right, rule, expected):
 def test_a_gap_is_a_pair_of_which_a_file_is_absent():
     left, right = paths("l/cam_left_9.png", "l/cam_left_10.png"), paths("r/cam_right_9.png", "r/cam_right_11.png")
     more = paths("l/cam_left_12.png", "l/cam_left_13.png"), paths("r/cam_right_12.png", "r/cam_right_13.png")
-    pairs = pair_up(left + more[0], right + more[1], gaps=True)
+    pairs = pair_up(left + more[0], right + more[1])
     assert [(p.left.name, p.right.name) for p in pairs] == [
         (f"cam_left_{k}.png", f"cam_right_{k}.png") for k in (9, 10, 11, 12, 13)
     ]
     assert [p.absent for p in pairs] == ["", "r/cam_right_10.png is missing", "l/cam_left_11.png is missing", "", ""]
     with raises("RIL-259"):
-        pair_up(left, right, gaps=True)  # more is missing than whole
+        pair_up(left, right)  # more is missing than whole
+
+
+@pytest.mark.parametrize(
+    ("names", "lost"),
+    [
+        ("{k}/{side}.png", "2/right.png"),
+        ("frame_{k:02d}/{side}/img.png", "frame_02/right/img.png"),
+        ("{side}/{side}_{k}/1.png", "right/right_2/1.png"),
+        ("{k}.5/im_{side}.png", "2.5/im_right.png"),
+    ],
+)
+@pytest.mark.parametrize("rule", ["auto", "folder"])
+def test_a_missing_image_loses_its_pair_alone_where_each_frame_has_its_folder(names, lost, rule):
+    root = Path("/drives/left_1")  # whose name tells no side
+    left, right = ([root / names.format(k=k, side=side) for k in (0, 1, 2, 9, 10)] for side in ("left", "right"))
+    pairs = pair_up(left[::-1], [path for path in right if path != root / lost], rule)
+    assert [(pair.left, pair.right) for pair in pairs] == list(zip(left, right, strict=True))
+    assert [pair.absent for pair in pairs] == ["", "", f"{lost} is missing", "", ""]
+
+
+@pytest.mark.parametrize("name", ["im", "I", "cam", "image_", "image_0", "view"])
+@pytest.mark.parametrize("place", ["/d/{side}/{name}{k}.png", "/d/{name}{k}/{side}.png"])
+def test_a_word_of_a_side_in_names_that_both_sides_have_tells_no_side(name, place):
+    left, right = (paths(*(place.format(side=s, name=name, k=k) for k in range(12))) for s in ("left", "right"))
+    pairs = pair_up(left, right[:5] + right[6:])
+    assert [(pair.left, pair.right) for pair in pairs] == list(zip(left, right, strict=True))
+    assert [k for k, pair in enumerate(pairs) if pair.absent] == [5]
+
+
+def test_a_stated_rule_is_kept_where_each_frame_has_its_folder():
+    sides = [paths(*(f"{k}/{side}.png" for k in range(3))) for side in ("left", "right")]
+    for rule, code in (("name", "RIL-258"), ("number", "RIL-257"), ("nearest", "RIL-822")):
+        with raises(code):
+            pair_up(*sides, rule)
+    assert len(pair_up(*sides, "order")) == 3
 
 
 def test_numbers_in_names_sort_as_numbers():
@@ -178,10 +212,10 @@ def test_size_of_another_kind_of_file_is_read(tmp_path):
 
 
 def test_unequal_counts_name_both_ends():
-    left, right = [[Path(f"{side}/{k:03d}.png") for k in range(n)] for side, n in (("a", 5), ("b", 3))]
-    with raises("RIL-256", "000.png to 004.png", "000.png to 002.png"):
+    left, right = [[Path(f"{side}/{k:03d}.png") for k in range(n)] for side, n in (("a", 5), ("b", 2))]
+    with raises("RIL-256", "000.png to 004.png", "000.png to 001.png"):
         pair_up(left, right, "order")
-    with raises("RIL-259", "000.png to 004.png", "000.png to 002.png"):
+    with raises("RIL-259", "000.png to 004.png", "000.png to 001.png"):
         pair_up(left, right, "name")
 
 
@@ -277,7 +311,7 @@ def test_a_date_that_all_names_share_is_no_time_stamp():
 def test_a_counter_that_began_anew_goes_on_where_it_ended(first):
     names, lines = [f"{k:03d}.png" for k in (*range(996, 1000), *range(first, 3))], []
     shuffled = random.Random(1).sample(names, len(names))
-    pairs = pair_up(paths(*(f"l/{n}" for n in shuffled)), paths(*(f"r/{n}" for n in names)), gaps=True, warnings=lines)
+    pairs = pair_up(paths(*(f"l/{n}" for n in shuffled)), paths(*(f"r/{n}" for n in names)), warnings=lines)
     assert [pair.left.name for pair in pairs] == [pair.right.name for pair in pairs] == names
     assert lines == [
         "RIL-707: the counter of the images began anew: they are taken from 996.png on to 002.png; if that is wrong, "
@@ -296,5 +330,5 @@ def test_a_counter_before_the_cameras_number_is_said_to_have_begun_anew():
 def test_numbers_from_the_least_to_the_greatest_are_no_counter_that_began_anew(numbers):
     names, lines = [f"{k:03d}.png" for k in numbers], []
     pairs = pair_up(paths(*(f"l/{n}" for n in names)), paths(*(f"r/{n}" for n in names)), warnings=lines)
-    assert [pair.left.name for pair in pairs] == names
+    assert [pair.left.name for pair in pairs if not pair.absent] == names
     assert not lines

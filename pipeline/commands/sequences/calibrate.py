@@ -94,7 +94,7 @@ def calibrate(
     chessboard.board_points((3, 3), square)  # refuses a wrong unit before minutes of detection
     pictures = _files(left, right)
     try:
-        pairs = pairing.pair_up(*pictures, gaps=True)
+        pairs = pairing.pair_up(*pictures)
     except InputError as error:  # its remedy is for manifests
         remedy = "give both pictures of a pair one name or number, each side in a folder or glob of its own"
         raise InputError(error.code, error.message, remedy=remedy) from error

@@ -92,6 +92,7 @@ class Inspection:
         self.frames = tuple(f for f in frames if f not in self.lost)
         self.levels: Counter[str] = Counter()
         self.broken: set[tuple[int, str]] = set()
+        self.exchanged = False
 
     def say(self, *findings: Finding | None) -> None:
         """Print findings, and count them by level."""
@@ -176,7 +177,9 @@ class Inspection:
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)
         swapped = sum(one["swapped"] for one in facts.values())
-        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
+        sides = judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names)
+        self.say(sides)
+        self.exchanged = sides.level == "FAIL"
         return next((pair for pair in tests if pair not in unlike), whole[0])
 
     def _first_pair(self, pair: int) -> Steps:
@@ -195,7 +198,7 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
         self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
-        if len(left):
+        if len(left) and not self.exchanged:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
         self.say(judge.judge_epipolar(oriented.meta))
@@ -204,7 +207,8 @@ class Inspection:
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
         if fitted.ref is None:
-            self.refused(_cause(fitted), "rig")
+            if not self.exchanged:  # which is why no rig fits
+                self.refused(_cause(fitted), "rig")
         elif "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))

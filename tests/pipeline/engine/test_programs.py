@@ -7,6 +7,7 @@ import json
 import math
 import multiprocessing
 import os
+import runpy
 import shutil
 import signal
 import subprocess
@@ -203,22 +204,22 @@ def test_a_process_forked_after_a_run_is_refused():
     assert code_in_a_pool("fork", "inline") == "RIL-543"
 
 
-def test_a_program_without_a_guard_is_refused_where_its_workers_import_it(tmp_path):
+@pytest.mark.parametrize("name", ["__main__", "__mp_main__"])  # that of the program, and where a worker imports it
+def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_path, name):
     program = tmp_path / "program.py"
     program.write_text(
-        "import multiprocessing\n"
         "from rille.pipeline.engine import workers\n"
-        "workers.check('inline'), workers.check('dask')\n"
-        "if __name__ == '__main__':\n"
-        "    child = multiprocessing.get_context('spawn').Process(target=print)\n"
-        "    child.start()\n"
-        "    child.join()\n"
-        "    raise SystemExit(child.exitcode)\n"
+        "def work(kind):\n    workers.check(kind)\n"
+        "work('inline')\n"
+        "if __name__ in ('__main__', '__mp_main__'):\n    work('dask')\n"
+        "work('dask') if __name__ else None\n"
     )
-    found = subprocess.run([sys.executable, program], capture_output=True, text=True)
-    assert found.returncode == 1
-    assert 'under `if __name__ == "__main__":`' in found.stderr
-    assert "line 3" in found.stderr, "the place in the program"
+    runpy.run_path(str(program), run_name=name)
+    with program.open("a") as file:
+        file.write("for kind in ('inline', 'dask'):\n    work(kind)\n")
+    with raises("RIL-972", f"line 9 of {program}"):
+        runpy.run_path(str(program), run_name=name)
+    exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": workers.check})  # no worker imports it
 
 
 @pytest.mark.parametrize("begun", [0, 1, 2])

@@ -14,6 +14,7 @@ from raising import raises
 
 from rille.pipeline.engine.runtime import environment
 from rille.pipeline.runs import session
+from rille.stages.core.errors import ConfigError
 
 NOW = datetime(2026, 1, 2, tzinfo=UTC)
 
@@ -32,8 +33,9 @@ def test_quiet_is_a_kind_of_progress():
 
 def test_a_folder_that_is_a_broken_link_is_named(tmp_path):
     (tmp_path / "runs").symlink_to("gone/runs")
-    with raises("RIL-061", "--runs"):
+    with raises("RIL-061", "--runs") as error:
         session._make_folder(tmp_path / "runs" / "toy", NOW)
+    assert isinstance(error.value, ConfigError)  # which ends a watch at once
 
 
 def test_results_are_whole_where_no_link_can_be_made(tmp_path, monkeypatch, capsys):
