@@ -165,7 +165,9 @@ def _unguarded() -> str:
     empty if a guard keeps it away."""
     for frame, line in traceback.walk_stack(inspect.currentframe()):
         if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") in ("__main__", "__mp_main__"):
-            file = frame.f_code.co_filename
+            file, spec = frame.f_code.co_filename, frame.f_globals.get("__spec__")
+            if spec is not None and spec.name.endswith("__main__"):  # of a package: no worker imports that
+                return ""
             try:
                 statements = ast.parse(Path(file).read_bytes()).body
             except (OSError, SyntaxError, ValueError):  # of an interactive Python there is no file

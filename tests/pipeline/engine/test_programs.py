@@ -222,6 +222,16 @@ def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_p
     exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": workers.check})  # no worker imports it
 
 
+def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):
+    """No worker imports its ``__main__``."""
+    (tmp_path / "package").mkdir()
+    begin = "from rille.pipeline.engine import workers\nworkers.check('dask')\n"
+    for name in ("__init__.py", "__main__.py"):
+        (tmp_path / "package" / name).write_text(begin if name == "__main__.py" else "")
+    monkeypatch.syspath_prepend(tmp_path)
+    runpy.run_module("package", run_name="__main__", alter_sys=True)
+
+
 @pytest.mark.parametrize("begun", [0, 1, 2])
 def test_no_worker_that_still_starts_outlives_a_run_that_is_broken_off(begun, tmp_path):
     workers.resource_tracker.ensure_running()
