@@ -49,10 +49,12 @@ def account(scene: Scene, frames: Rows, pairs: Rows, unlike: Sequence[str] = ())
 
 def complete(accounted: Mapping[str, Any], view: RunView, figures: Sequence[Figure]) -> dict[str, Any]:
     """The lists of :func:`account` with what became of tasks and figures: all that a reader might take for granted."""
-    done = ["every task was done"] if view.tasks and all(t.status in ("computed", "cached") for t in view.tasks) else []
+    made = {t.label for t in view.tasks if t.status in ("computed", "cached")}
+    done = ["every task was done"] if view.tasks and len(made) == len(view.tasks) else []
     if view.part:
         absent = [_item("part", f"Left out, as {view.part} asks", left_out(view.left_out))]
-        judged = ("contradiction", *(("no pose", "piece") if view.bundle(view.products.trajectory) is not None else ()))
+        posed = any(label.partition("/")[0] == "trajectory" for label in made)
+        judged = ("contradiction", *(("no pose", "piece") if posed else ()))
         wrong = [item for item in accounted["missing"] if item["kind"] in judged]
         return {"delivered": done, "absent": absent, "missing": [*wrong, *_failures(view), *_unmade(view)]}
     undrawn = [_item("figure", figure.title, figure.why) for figure in figures if figure.why]

@@ -134,15 +134,14 @@ def test_what_the_images_contradict_is_told_before_what_failed():
     assert [m["kind"] for m in told] == ["contradiction", "failed"]
 
 
-@pytest.mark.parametrize("trajectory", [None, "left out", "made"])
-def test_a_part_that_poses_frames_misses_those_that_have_no_pose(trajectory):
-    products = SimpleNamespace(trajectory=trajectory)
-    given = {"tasks": [], "part": "--until trajectory", "left_out": {}, "until": (), "only": ()}
-    given["bundle"] = {"made": "artifact"}.get
+@pytest.mark.parametrize("made", [True, False])
+def test_a_part_that_poses_frames_misses_those_that_have_no_pose(made):
+    tasks = [TaskRow("trajectory" if made else "track/0", "trajectory" if made else "track", "computed")]
+    given = {"tasks": tasks, "part": "--until trajectory", "left_out": {}, "until": (), "only": ()}
     rows = [{"frame": k, "posed": k != 1, "in_world": k < 2} for k in range(3)]
     found = {"missing": delivery._poses(rows), "absent": [], "delivered": []}
-    told = delivery.complete(found, SimpleNamespace(products=products, **given), [])["missing"]
-    assert [m["why"] for m in told] == (["frame 1", "frame 2"] if trajectory == "made" else [])
+    told = delivery.complete(found, SimpleNamespace(**given), [])["missing"]
+    assert [m["why"] for m in told] == (["frame 1", "frame 2"] if made else [])
 
 
 @pytest.mark.parametrize(
