@@ -40,13 +40,6 @@ ZED_SIZES = {
 """Pixels of the resolutions in a ``.conf``."""
 
 
-GROUP = re.compile(r"(in|ex)trinsics?")
-TURN = re.compile(
-    r"R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|T_(right_left|left_right)|toe_?in\w*", re.I
-)
-"""In a file of figures by key: parts with entries of their own, and keys that say how one camera is turned."""
-
-
 def zed(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras at each resolution. Lengths in the file are millimetres, here metres.
 
@@ -166,6 +159,13 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     fx, _, cx, _, fy, cy, _, _, _, *baseline = numbers_of_matrix(text)
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "baseline": next(iter(baseline), None)}
     return figures(Fields(values, str(path)), path)
+
+
+GROUP = re.compile(r"(in|ex)trinsics?")
+TURN = re.compile(
+    r"R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|T_(right_left|left_right)|toe_?in\w*", re.I
+)
+"""In a file of figures by key: parts with entries of their own, and keys that say how one camera is turned."""
 
 
 def _flat(f: Fields) -> Fields:
