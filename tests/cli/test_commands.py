@@ -75,6 +75,7 @@ def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(plac
     assert [item["kind"] for item in report["absent"]] == ["part"]
 
 
+@pytest.mark.slow
 def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None:
     crate, runs = tmp_path / "crate", tmp_path / "runs"
     exported = place.rille("export", "other", "--to", "rocrate", "--output", crate)
