@@ -8,7 +8,7 @@ multiply row vectors. A focal length of one camera alone that is off stretches i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -76,7 +76,8 @@ def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: S
     between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
     both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
     both[EXCHANGED] = off({"left": lenses["right"], "right": lenses["left"]})
-    ratio, fitted = _least(spread)
+    found = minimize_scalar(spread, bounds=(1.0 / MAX_RATIO, MAX_RATIO), method="bounded", options={"xatol": 1e-4})
+    ratio, fitted = float(found.x), float(found.fun)
     focal = f"the right camera's is {ratio:.3f} times as given, or the left one's {1 / ratio:.3f} times"
     if fitted <= 0.5 * min(spread(1.0), off(lenses, repaired)):
         both[focal] = fitted
@@ -98,9 +99,3 @@ def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: S
 def _longer(lens: Lens, ratio: float) -> Lens:
     """The lens with a focal length that is ``ratio`` times as long."""
     return replace(lens, camera=replace(lens.camera, fx=lens.camera.fx * ratio, fy=lens.camera.fy * ratio))
-
-
-def _least(spread: Callable[[float], float]) -> tuple[float, float]:
-    """Ratio of a focal length to the given one at which a spread is least, and that spread."""
-    found = minimize_scalar(spread, bounds=(1.0 / MAX_RATIO, MAX_RATIO), method="bounded", options={"xatol": 1e-4})
-    return float(found.x), float(found.fun)

@@ -43,7 +43,7 @@ FACTORS = (-1.0, 0.5, 2.0, 1.0 / 16, 16.0, 1.0 / 256, 256.0)
 """Factors of the values of wrong maps: the sign, images of another size, counts of SGBM, counts of KITTI's PNG."""
 
 
-def otherwise(left: AnyArray, right: AnyArray, column: AnyArray) -> str:
+def better_reading(left: AnyArray, right: AnyArray, column: AnyArray) -> str:
     """How given column displacements (row, col) fit two grey images that they do not fit as they are; empty: no way."""
     readings = {f"their values times {factor:g}": column * np.float32(factor) for factor in FACTORS}
     readings["their rows in reverse"] = column[::-1]
@@ -150,7 +150,7 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
     said = facts(arrays, params, ImageDifference(), int(np.count_nonzero(a.valid[0])))
     column = np.asarray(given["column_disparity"])
     if np.mean(matched(arrays["validity"])) < MIN_BORNE_OUT * np.mean(np.isfinite(column)):
-        fit = otherwise(a.images[0], b.images[0], column)
+        fit = better_reading(a.images[0], b.images[0], column)
         how = (
             f"they fit with {fit}: correct them, or [disparity]" if fit else "are they of these left images, in pixels?"
         )

@@ -9,7 +9,7 @@ from matching_scenes import Texture
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity, has, matched
-from rille.stages.hfvm.given import check, hfvm_given_stage, otherwise
+from rille.stages.hfvm.given import better_reading, check, hfvm_given_stage
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import PyramidParams, pyramid_stage
@@ -173,7 +173,7 @@ def test_a_map_that_fits_otherwise_is_named_with_how(wrong, fit):
     nearer = 4 + np.arange(ROWS) // 8
     right = np.array([np.roll(row, -by) for row, by in zip(left, nearer, strict=True)])
     u = np.repeat(-nearer[:, None], COLS, axis=1).astype(np.float32)
-    assert otherwise(left, right, wrong(u)) == fit
+    assert better_reading(left, right, wrong(u)) == fit
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1, []), (16, ["their values times 0.0625"])])
