@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from rille.stages.calibration.relative_orientation import RIG, PointPairs
 from rille.stages.core.arrays import Floats
@@ -76,7 +76,9 @@ def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: S
     between = RigidTransform(rig.T_right_left.rotation.T, rig.T_right_left.translation)
     both[TRANSPOSED] = off(lenses, replace(rig, T_right_left=between))
     both[EXCHANGED] = off({"left": lenses["right"], "right": lenses["left"]})
-    found = minimize_scalar(spread, bounds=(1.0 / MAX_RATIO, MAX_RATIO), method="bounded", options={"xatol": 1e-4})
+    found = scipy.optimize.minimize_scalar(
+        spread, bounds=(1.0 / MAX_RATIO, MAX_RATIO), method="bounded", options={"xatol": 1e-4}
+    )
     ratio, fitted = float(found.x), float(found.fun)
     focal = f"the right camera's is {ratio:.3f} times as given, or the left one's {1 / ratio:.3f} times"
     if fitted <= 0.5 * min(spread(1.0), off(lenses, repaired)):
