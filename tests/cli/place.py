@@ -133,16 +133,22 @@ class Place:
         )
         return Done(done.returncode, done.stdout, done.stderr)
 
-    def here(self, *words: str) -> Done:
-        """Call ``rille`` in this process, which spares the start of another one: for what ends before it computes."""
+    def here(self, *words: str | Path, folder: Path | None = None) -> Done:
+        """Call ``rille`` in this process, which spares the start of another one."""
         out, err = io.StringIO(), io.StringIO()
         environment = {name: value for name, value in os.environ.items() if not name.startswith("RILLE_")}
         with pytest.MonkeyPatch.context() as patched, redirect_stdout(out), redirect_stderr(err):
-            patched.chdir(self.folder)
+            patched.chdir(folder or self.folder)
             patched.setattr(os, "environ", environment)
             with pytest.raises(SystemExit) as ended:
-                main(list(words))
+                main(list(map(str, words)))
         return Done(int(ended.value.code or 0), out.getvalue(), err.getvalue())
+
+    def twice(self, *words: str | Path, folder: Path | None = None) -> Done:
+        """What a command says, as a user starts it, and the same again in this process."""
+        first = self.rille(*words, folder=folder)
+        assert self.here(*words, folder=folder) == first
+        return first
 
     def made(self) -> set[Path]:
         """Files and folders here, and the folders of all runs."""

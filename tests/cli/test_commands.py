@@ -63,7 +63,7 @@ def test_reconstruct(place: Place, name: str, frames: int) -> None:
 
 def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(place: Place, tmp_path: Path) -> None:
     words = ["reconstruct", *MOCKUP, "--only", "trajectory.tum", "--runs", str(tmp_path)]
-    first, second = place.rille(*words), place.rille(*words)
+    first, second = place.rille(*words), place.here(*words)
     assert (first.status, second.status) == (0, 0), first.err + second.err
     assert re.fullmatch(r"left out, as --only trajectory.tum asks: \d+ known tasks \(.*locus.*\), .*", second.last)
     run = tmp_path / "mockup-short" / "latest"
@@ -140,12 +140,11 @@ def test_drive(place: Place) -> None:
 
 @pytest.mark.parametrize("words", [MOCKUP, OTHER], ids=lambda words: words[0])
 def test_plan_of_what_is_there_finds_nothing_to_do(place: Place, words: list[str]) -> None:
-    first, second = place.rille("plan", *words), place.rille("plan", *words)
+    first = place.twice("plan", *words)
     assert (first.status, first.err) == (0, "")
     ran = re.search(r"computed 0, cached (\d+)", place.said[f"{'other' if words is OTHER else 'mockup'} again"].last)
     assert ran is not None
     assert first.last == f"{ran[1]} tasks known: {ran[1]} cached, 0 to do", "outputs are tasks too"
-    assert first == second
 
 
 @pytest.mark.parametrize(
@@ -159,7 +158,7 @@ def test_plan_of_what_is_there_finds_nothing_to_do(place: Place, words: list[str
     ids=["a shorter sequence", "later frames", "one frame", "another parameter"],
 )
 def test_plan_of_something_else_in_the_same_cache(place: Place, words: list[str], cached: bool) -> None:
-    first, second = place.rille("plan", *words), place.rille("plan", *words, "--verbose")
+    first, second = place.here("plan", *words), place.here("plan", *words, "--verbose")
     assert (first.status, first.err) == (0, "")
     assert (second.status, second.err) == (0, "")
     assert first.last.startswith("memory: the largest task, ")
@@ -175,20 +174,18 @@ def test_plan_of_something_else_in_the_same_cache(place: Place, words: list[str]
 @pytest.mark.parametrize("sequence", ["mockup-short", "other"])
 @pytest.mark.parametrize("task", ["trajectory", "hfvm/0"])
 def test_why_tells_of_its_own_sequence(place: Place, sequence: str, task: str) -> None:
-    first, second = place.rille("why", sequence, task), place.rille("why", sequence, task)
+    first = place.twice("why", sequence, task)
     assert (first.status, first.err) == (0, "")
     stage = task.partition("/")[0]
     run = place.runs(sequence)[-1].name
     assert re.fullmatch(rf"{task}: stage {stage}, (computed|cached) in run {sequence}/{run}", first.lines[0])
     others = {"mockup-short", "other", "mockup-loop"} - {sequence}
     assert not [line for line in first.lines if line.startswith("since") and any(f"{o}/" in line for o in others)]
-    assert first == second
 
 
 def test_runs(place: Place) -> None:
-    first, second = place.rille("runs"), place.rille("runs")
+    first = place.twice("runs")
     assert (first.status, first.err) == (0, "")
-    assert first == second
     rows = {line.split()[0]: line.split()[1:] for line in first.lines[1:]}
     assert len(rows) == 6
     for run in place.runs("other"):
@@ -197,7 +194,7 @@ def test_runs(place: Place) -> None:
         assert len(set(posed.split("/"))) == 1
         assert (int(computed) > 0) == (run == place.runs("other")[0])
         assert int(computed) + int(cached) > 0 < float(seconds)
-    assert place.rille("runs", "other").lines[1:] == [line for line in first.lines[1:] if line.startswith("other/")]
+    assert place.here("runs", "other").lines[1:] == [line for line in first.lines[1:] if line.startswith("other/")]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -209,14 +206,13 @@ def test_completion_knows_commands_and_options(shell: str) -> None:
 def test_timing(place: Place) -> None:
     for run in ("mockup-loop", "other"):
         name = f"{run}/{place.runs(run)[0].name}"  # the one that has computed
-        first, second = place.rille("timing", name), place.rille("timing", name)
+        first = place.twice("timing", name)
         assert (first.status, first.err) == (0, "")
         assert first.lines[0].startswith(f"run {name}: ")
         computed, cached = first.lines[-1].split()[-2:]
         assert first.lines[-1].startswith("all ")
         assert int(computed) > int(cached)
-        assert first == second
-    assert place.rille("timing").lines[0].startswith("run mockup-loop/")
+    assert place.here("timing").lines[0].startswith("run mockup-loop/")
 
 
 def test_view(place: Place) -> None:
@@ -229,7 +225,7 @@ def test_compare(place: Place) -> None:
     same = place.rille("compare", *(f"other/{run.name}" for run in (place.runs("other")[0], place.runs("other")[-1])))
     assert (same.status, same.err) == (0, "")
     assert any(line.endswith(" with the same result, 0 with another") for line in same.lines)
-    apart = place.rille("compare", "other", "mockup-short")
+    apart = place.here("compare", "other", "mockup-short")
     assert apart.status == 0
     assert apart.last.startswith("positions     ")
 
@@ -256,15 +252,15 @@ def test_init_writes_a_manifest_and_replaces_none(place: Place, tmp_path: Path) 
     shutil.copytree(place.folder / "other", tmp_path / "rover")
     assert place.rille("init", "rover", folder=tmp_path).status == 0
     assert not list(tmp_path.glob("*.toml")), "it opens as it is"
-    written = place.rille("init", "rover", "--force", folder=tmp_path)
+    written = place.here("init", "rover", "--force", folder=tmp_path)
     assert (written.status, written.err) == (0, "")
     manifest = tmp_path / "rover.rille.toml"
     before = manifest.read_bytes()
-    refused = place.rille("init", "rover", "--output", manifest, folder=tmp_path)
+    refused = place.here("init", "rover", "--output", manifest, folder=tmp_path)
     assert refused.status == 2
     assert refused.complaint.startswith("rille: error RIL-038: ")
     assert manifest.read_bytes() == before
-    assert place.rille("init", "rover", "--force", folder=tmp_path) == written
+    assert place.here("init", "rover", "--force", folder=tmp_path) == written
     assert manifest.read_bytes() == before
 
 
@@ -284,7 +280,7 @@ def test_calibrate(place: Place, data_dir: Path, tmp_path: Path) -> None:
 
 def test_calibrate_wants_a_board(place: Place, tmp_path: Path) -> None:
     images = place.folder / "other"
-    done = place.rille("calibrate", images / "left", images / "right", "--square", "0.1", folder=tmp_path)
+    done = place.here("calibrate", images / "left", images / "right", "--square", "0.1", folder=tmp_path)
     assert (done.status, done.out) == (2, "")
     assert done.complaint.startswith("rille: error RIL-153: ")
     assert not list(tmp_path.iterdir())
@@ -298,7 +294,7 @@ def test_match(place: Place, tmp_path: Path) -> None:
     assert re.match(r"disparity\.tif  matched \d+\.\d %, ", first.lines[0])
     files = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     assert set(files) == {"disparity.tif", "confidence.tif"}
-    assert place.rille(*words, folder=tmp_path) == first
+    assert place.here(*words, folder=tmp_path) == first
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == files
 
 
@@ -309,7 +305,7 @@ def test_export(place: Place, kind: str, made: str, tmp_path: Path) -> None:
     assert (first.status, first.err) == (0, "")
     assert first.last.startswith(f"{tmp_path / made}  ")
     assert set(files) == {made}
-    assert place.rille(*words) == first
+    assert place.here(*words) == first
     assert contents(tmp_path) == files
 
 
@@ -319,7 +315,7 @@ def test_export_of_a_model_replaces_none(place: Place, tmp_path: Path) -> None:
     assert (first.status, first.err) == (0, "")
     assert first.last.startswith(f"{tmp_path / 'colmap'}  2 frames of 2 images, ")
     assert len(files) > 3
-    again = place.rille(*words)
+    again = place.here(*words)
     assert (again.status, again.out) == (2, "")
     assert again.complaint.startswith("rille: error RIL-607: ")
     assert contents(tmp_path) == files
@@ -333,7 +329,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_compare_dem(place: Place, tmp_path: Path) -> None:
     first_run, last_run = place.runs("mockup-short")
     first = place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path)
-    named = place.rille("compare-dem", "mockup-short", last_run / "dem.tif", "--output", tmp_path / "named")
+    named = place.here("compare-dem", "mockup-short", last_run / "dem.tif", "--output", tmp_path / "named")
     assert named.lines[2:-1] == first.lines[2:-1]
     for path in tmp_path.glob("named.*"):
         path.unlink()
@@ -342,32 +338,31 @@ def test_compare_dem(place: Place, tmp_path: Path) -> None:
     found = contents(tmp_path)
     assert set(found) == {"dem_comparison.tif", "dem_comparison.json"}
     assert "RMSE 0 m" in first.out
-    assert place.rille("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path) == first
+    assert place.here("compare-dem", first_run, last_run / "dem.tif", folder=tmp_path) == first
     assert contents(tmp_path) == found
 
 
 def test_datasets(place: Place, tmp_path: Path) -> None:
     listed = place.rille("datasets", "list")
-    assert listed == place.rille("datasets")
+    assert listed == place.here("datasets")
     assert (listed.status, listed.err) == (0, "")
     assert [line.split()[0] for line in listed.lines[:3]] == ["mockup", "mockup-short", "mockup-loop"]
     exported = place.said["export"]
     assert (exported.status, exported.out, exported.err) == (0, "other\n", "")
-    again = place.rille("datasets", "export", place.folder / "other", "copy", folder=tmp_path)
+    again = place.here("datasets", "export", place.folder / "other", "copy", folder=tmp_path)
     assert (again.status, again.last) == (0, "copy")
     assert (tmp_path / "copy/left/000000.png").is_file()
     small = [f"--set={word}" for word in ("mockup.frames=1", "mockup.image_width=95", "mockup.image_height=87")]
-    first = place.rille("datasets", "export", "mockup-short", "one", "--cache", "new", *small, folder=tmp_path)
+    first = place.here("datasets", "export", "mockup-short", "one", "--cache", "new", *small, folder=tmp_path)
     assert first.status == 0
-    assert "earlier format" not in place.rille("plan", "mockup-short", "--cache", tmp_path / "new").err
+    assert "earlier format" not in place.here("plan", "mockup-short", "--cache", tmp_path / "new").err
 
 
 def test_cache_gc_removes_nothing_that_a_run_uses(place: Place) -> None:
     before = {str(p) for p in (place.folder / ".rille/cache").rglob("*")}
-    for _ in range(2):
-        done = place.rille("cache", "gc", "--dry-run")
-        assert (done.status, done.err) == (0, "")
-        assert done.last.startswith("would remove 0 artifacts and 0 leftovers")
+    done = place.twice("cache", "gc", "--dry-run")
+    assert (done.status, done.err) == (0, "")
+    assert done.last.startswith("would remove 0 artifacts and 0 leftovers")
     assert before <= {str(p) for p in (place.folder / ".rille/cache").rglob("*")}
 
 
@@ -381,15 +376,14 @@ def test_cache_verify_names_what_is_damaged(place: Place, tmp_path: Path) -> Non
     data = bytearray(artifact.read_bytes())
     data[len(data) // 2] ^= 255
     artifact.write_bytes(data)
-    damaged = place.rille("cache", "verify", "--cache", copy)
+    damaged = place.here("cache", "verify", "--cache", copy)
     assert damaged.status == 1
     assert damaged.last.endswith(" 1 damaged")
     assert re.match(r"rille: trajectory(/\d+)? \(trajectory\): ", damaged.complaint)
-    assert place.rille("cache", "verify", "--cache", copy).status == 0, "it was set aside"
+    assert place.here("cache", "verify", "--cache", copy).status == 0, "it was set aside"
 
 
 def test_params(place: Place) -> None:
-    first, second = place.rille("params", "locus"), place.rille("params", "locus")
+    first = place.twice("params", "locus")
     assert (first.status, first.err) == (0, "")
     assert first.lines[0].startswith("locus.cell_size = ")
-    assert first == second

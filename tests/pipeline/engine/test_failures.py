@@ -93,7 +93,9 @@ def test_a_cache_that_cannot_be_written_is_refused_before_anything_is_computed(t
         Store(tmp_path / "file").writable()
 
 
+TINY = ["mockup.image_width=96", "mockup.image_height=80", "mockup.focal_length=100.0", "locus.cell_size=0.01"]
 SMALL = ["--frames", "0:2", "--set", "crosscheck.enabled=false", "--set", "hfvm.preset=fast"]
+SMALL += [word for assignment in TINY for word in ("--set", assignment)]
 
 
 def test_a_run_whose_folder_is_removed_meanwhile_is_no_success(tmp_path, monkeypatch, capsys):

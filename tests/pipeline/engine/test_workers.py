@@ -128,10 +128,9 @@ def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
         foreign.compare(foreign.identity(), tmp_path / "probe" / "token")
 
 
-def test_an_adaptive_cluster_without_workers_starts_one(tmp_path, monkeypatch):
+def test_an_adaptive_cluster_without_workers_starts_one(tmp_path):
     from distributed import Client, LocalCluster
 
-    monkeypatch.setattr(workers, "NO_WORKERS_SECONDS", 5.0)
     with (
         LocalCluster(processes=False, n_workers=0, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster, set_as_default=False) as client,

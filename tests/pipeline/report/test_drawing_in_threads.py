@@ -22,7 +22,7 @@ def draw(seed: int) -> Figure:
 
 
 def test_threads_share_no_sheet_at_a_time() -> None:
-    alone = [draw(seed) for seed in range(16)]
+    alone = [draw(seed) for seed in range(8)]
     assert not [figure.why for figure in alone if figure.why]
     with ThreadPoolExecutor(8) as threads:
-        assert list(threads.map(draw, range(16))) == alone
+        assert list(threads.map(draw, range(8))) == alone
