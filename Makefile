@@ -30,8 +30,9 @@ help: ## this list
 install: $(VENV)/.compiled ## make .venv with rille and what a run needs, pinned, and compile the kernels
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
-	  || { echo "rille needs Python 3.11 or newer; say which with PYTHON=..." >&2; exit 2; }
+	@# Of newer ones the pinned packages have no wheels.
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' \
+	  || { echo "rille needs Python 3.11 to 3.14; say which with PYTHON=..." >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e .
 	@touch $@
