@@ -34,10 +34,6 @@ So many points because models that are half as wrong show half as small an error
 """
 
 
-ACCURATE_REFINEMENT: dict[str, Any] = {"locus": {"refined_share": 0.5}}
-"""What it sets besides if the matcher is accurate: the mean of the elevations by disparity and by refinement is better
-than either."""
-
 FAST_REFINEMENT: dict[str, Any] = {"locus": {"refine_steps": 6}}
 """What ``hfvm.preset = "fast"`` sets in other sections: two steps leave more of its larger errors (after six, errors of
 merged elevations of three beds are .87 to .91 times those, within one standard deviation .68 instead of .56)."""
@@ -217,8 +213,6 @@ def build(*layers: Mapping[str, Any]) -> Params:
         merge(nested, layer)
     if _preset(nested, "terrain") == "accurate":
         nested = _beneath(nested, ACCURATE_TERRAIN)
-        if _preset(nested, "hfvm") == "accurate":
-            nested = _beneath(nested, ACCURATE_REFINEMENT)
     if _preset(nested, "hfvm") == "fast":
         nested = _beneath(nested, FAST_REFINEMENT)
     if _preset(nested, "keyframes") == "navigation":

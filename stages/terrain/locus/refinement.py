@@ -24,9 +24,9 @@ from rille.stages.numeric.relaxation import bend_weights, relax
 from rille.stages.numeric.windows import window_sum32
 from rille.stages.terrain.locus.views import OrthoPair, SurfaceViews, look
 
-BEND_STIFFNESS = 4000.0
+BEND_STIFFNESS = 2000.0
 """Squared grey levels for a bend of a pixel of disparity: strong against noise, weak against texture; the error is flat
-from 2000 to 16000."""
+from 1000 to 4000."""
 MAX_BEND_PX = 0.05
 """Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
 
@@ -54,7 +54,7 @@ def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: in
     for _ in range(steps):
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
-        slope = np.where(keep, seen.right_slope - seen.left_slope, np.float32(0.0))
+        slope = np.where(keep, 0.5 * (seen.right_slope - seen.left_slope), np.float32(0.0))
         bends = bend_weights(z, seen.scale, MAX_BEND_PX, BEND_STIFFNESS)
         moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, sweeps=20)
         # About the start, not the last step: many small steps could otherwise wander to another likeness. Beyond a

@@ -42,14 +42,11 @@ class LocusParams(Params):
     sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
     max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
     refine_steps: int = Field(
-        2,
+        3,
         ge=0,
         le=20,
         description="number of Gauss-Newton steps that refine the elevations by both images; 6 for matches of preset "
-        "fast, 2 for others; 0: none",
-    )
-    refined_share: float = Field(
-        1.0, gt=0, le=1, description="weight of the refined elevation; 0.5 for matches of preset accurate, 1 for others"
+        "fast, 3 for others; 0: none",
     )
     both: bool = Field(
         False, description="also match from right to left and use both elevations; doubles the time of matching"

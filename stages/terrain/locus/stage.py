@@ -107,7 +107,8 @@ def reconstruct(
         out = join(out, other)
     if right is not None and (params.refine_steps or back is not None):
         one, two = (View(P, coefficients(a)) for P, a in ((cameras.left, image), (cameras.right, right)))
-        seen = SurfaceViews(one, two, T_local_left.translation)
+        right_centre = (T_local_left @ rig.T_right_left.inverse()).translation
+        seen = SurfaceViews(one, two, T_local_left.translation, right_centre)
         _refine(out, seen, lattice, params, apart)
     leave_out_unsure(out, greatest_std(params, pair.matches.std is not None))
     return out
@@ -131,8 +132,7 @@ def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams
     moved = elevation - dem.elevation
     turned = facing(elevation, lattice, views.centre, NEAR_SIDE_CELLS)
     dem.elevation_std[...] = standard_deviation(elevation, seen, turned, moved, apart, dem.elevation_std)
-    share = np.float32(params.refined_share)
-    dem.elevation[...] = share * elevation + (np.float32(1.0) - share) * dem.elevation
+    dem.elevation[...] = elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)
 
 
@@ -242,7 +242,7 @@ class LocusInputs(NamedTuple):
 
 @stage(
     "locus",
-    version=6,
+    version=7,
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),

@@ -27,7 +27,7 @@ def test_fast_matches_are_refined_by_more_steps_unless_others_are_given() -> Non
         config.build({"hfvm": {"preset": "fast"}}, {"locus": locus}).locus.refine_steps
         for locus in ({}, {"refine_steps": 2})
     ]
-    assert [*steps, config.build().locus.refine_steps] == [6, 2, 2]
+    assert [*steps, config.build().locus.refine_steps] == [6, 2, 3]
 
 
 def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -> None:
@@ -35,15 +35,13 @@ def test_one_setting_makes_terrain_accurate_and_what_is_given_beside_it_wins() -
     assert (plain.hfvm.preset, plain.locus.both, plain.merge.max_std_cells) == ("default", False, None)
     built = config.build({"locus": {"cell_size": 0.01}}, config.parse_assignments(["terrain.preset=accurate"]))
     assert (built.hfvm.preset, built.locus.both, built.merge.max_std_cells) == ("accurate", True, 0.7)
-    assert (plain.locus.refined_share, built.locus.refined_share) == (1.0, 0.5)
     assert built.locus.cell_size == 0.01
     assert (plain.track.points, built.track.points) == (400, 2000)
     assert built.hfvm == config.build({"hfvm": {"preset": "accurate"}}).hfvm
     built = config.build({"terrain": {"preset": "accurate"}}, config.parse_assignments(["locus.both=false"]))
     assert (built.hfvm.preset, built.locus.both) == ("accurate", False)
-    assert built.locus.refined_share == 0.5, "that of the matcher"
     built = config.build({"terrain": {"preset": "accurate"}, "hfvm": {"preset": "default"}})
-    assert (built.locus.refined_share, built.locus.both) == (1.0, True), "one of each"
+    assert (built.hfvm.preset, built.locus.both) == ("default", True), "one of each"
     assert config.build().locus.both is False, "the preset itself is not changed by what is laid over it"
     with raises("RIL-027", "terrain.preset", "'best'"):
         config.build({"terrain": {"preset": "best"}})

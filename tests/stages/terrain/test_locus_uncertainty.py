@@ -9,6 +9,7 @@ from rille.stages.terrain.locus.uncertainty import (
     FLOOR_PX,
     HOLE_VARIANCE_PX2,
     MIN_AREA_PX,
+    MOVE_FACTOR,
     ONE_SIDED_DIFFERENCE_PX,
     REST_FACTOR,
     SHADE_FACTOR,
@@ -30,7 +31,7 @@ def ground(rise: float = RISE) -> tuple[np.ndarray, np.ndarray]:
     seen = np.empty((6, *SHAPE), np.float32)
     seen[0] = GREY
     seen[1] = GREY - NOISE * np.where((rows + cols) % 2, 1.0, -1.0)
-    seen[2], seen[5] = 0.0, CONTRAST * SCALE
+    seen[2], seen[5] = -CONTRAST * SCALE, CONTRAST * SCALE
     seen[3], seen[4] = SCALE, AREA
     return elevation, seen
 
@@ -59,7 +60,7 @@ def expected(
     variance += (
         (SHADE_FACTOR * noise / grey) ** 2
         + (DIFFERENCE_FACTOR * SCALE * apart) ** 2
-        + (SCALE * moved) ** 2 / max(area, MIN_AREA_PX)
+        + MOVE_FACTOR * (SCALE * moved) ** 2 / max(area, MIN_AREA_PX)
     )
     return float(np.sqrt(variance) / SCALE)
 
@@ -128,7 +129,7 @@ def test_a_single_cell_speaks_for_itself() -> None:
         np.sqrt(
             FLOOR_PX**2
             + (DIFFERENCE_FACTOR * ONE_SIDED_DIFFERENCE_PX) ** 2
-            + (SCALE * SHIFT) ** 2 / AREA
+            + MOVE_FACTOR * (SCALE * SHIFT) ** 2 / AREA
             + HOLE_VARIANCE_PX2 * 48 / 49
         )
         / SCALE,
