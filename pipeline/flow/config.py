@@ -22,36 +22,34 @@ from rille.datasets.text.validation import Model, validated
 from rille.stages.core.declare import Params, Stage, declared
 from rille.stages.core.errors import ConfigError
 
-ACCURATE_TERRAIN: dict[str, Any] = {
-    "hfvm": {"preset": "accurate"},
-    "locus": {"both": True},
-    "track": {"points": 2000},
-    "merge": {"max_std_cells": 0.7},
-}
-"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins.
-
-So many points because models that are half as wrong show half as small an error of the poses that merge them.
-"""
-
-
-ACCURATE_REFINEMENT: dict[str, Any] = {"locus": {"refined_share": 0.5}}
-"""What it sets besides if the matcher is accurate: the mean of the elevations by disparity and by refinement is better
-than either."""
-
-FAST_REFINEMENT: dict[str, Any] = {"locus": {"refine_steps": 6}}
-"""What ``hfvm.preset = "fast"`` sets in other sections: two steps leave more of its larger errors (after six, errors of
-merged elevations of three beds are .87 to .91 times those, within one standard deviation .68 instead of .56)."""
-
-NAVIGATION: dict[str, Any] = {
-    "hfvm": {"preset": "fast"},
-    "motion": {"level": 3},
-    "track": {"points": 200},
-    "orientation": {"samples": 600},
-}
-"""What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there.
-
-Half the resolution of disparities and displacements is enough for a trajectory.
-"""
+PRESETS: tuple[tuple[dict[str, str], dict[str, Any]], ...] = (
+    # So many points because models that are half as wrong show half as small an error of the poses that merge them.
+    (
+        {"terrain": "accurate"},
+        {
+            "hfvm": {"preset": "accurate"},
+            "locus": {"both": True},
+            "track": {"points": 2000},
+            "merge": {"max_std_cells": 0.7},
+        },
+    ),
+    # The mean of the elevations by disparity and by refinement is better than either.
+    ({"terrain": "accurate", "hfvm": "accurate"}, {"locus": {"refined_share": 0.5}}),
+    # Two steps leave more of its larger errors (after six, errors of merged elevations of three beds are .87 to .91
+    # times those, within one standard deviation .68 instead of .56).
+    ({"hfvm": "fast"}, {"locus": {"refine_steps": 6}}),
+    # Half the resolution of disparities and displacements is enough for a trajectory.
+    (
+        {"keyframes": "navigation"},
+        {
+            "hfvm": {"preset": "fast"},
+            "motion": {"level": 3},
+            "track": {"points": 200},
+            "orientation": {"samples": 600},
+        },
+    ),
+)
+"""Presets by section, and what they set in other sections, beneath the values that are given there."""
 
 
 class TerrainParams(Params):
@@ -215,25 +213,15 @@ def build(*layers: Mapping[str, Any]) -> Params:
     nested: dict[str, Any] = {}
     for layer in layers:
         merge(nested, layer)
-    if _preset(nested, "terrain") == "accurate":
-        nested = _beneath(nested, ACCURATE_TERRAIN)
-        if _preset(nested, "hfvm") == "accurate":
-            nested = _beneath(nested, ACCURATE_REFINEMENT)
-    if _preset(nested, "hfvm") == "fast":
-        nested = _beneath(nested, FAST_REFINEMENT)
-    if _preset(nested, "keyframes") == "navigation":
-        nested = _beneath(nested, NAVIGATION)
+    for presets, values in PRESETS:
+        if all(_preset(nested, section) == preset for section, preset in presets.items()):
+            nested = merge(merge({}, values), nested)
     return validate(model(), nested, also=DATASET_SECTIONS)
 
 
 def _preset(nested: Mapping[str, Any], section: str) -> Any:
     values = nested.get(section)
     return values.get("preset") if isinstance(values, Mapping) else None
-
-
-def _beneath(nested: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
-    """A preset beneath the given values, which win."""
-    return merge(merge({}, preset), nested)
 
 
 def validate(kind: type[Model], values: Mapping[str, Any], section: str = "", also: Iterable[str] = ()) -> Model:
