@@ -127,8 +127,9 @@ class TrueStand:
 
 @dataclass(frozen=True)
 class Way:
-    """Record of a leg: row of each frame in the leg's artifact, frames that are not lost, and what sensors said."""
+    """Record of a leg: its artifact ``drive``, row of each frame there, frames that are not lost, what sensors said."""
 
+    drive: Handle
     rows: dict[int, int]
     frames: list[int]
     sense: Handle
@@ -148,7 +149,6 @@ class Drive:
     posed : frames of the trajectory so far.
     goal : m, world frame.
     true : true pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate.
-    rows : row of each frame in the artifact of its leg.
     """
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
@@ -172,7 +172,6 @@ class Drive:
         self.goal: tuple[float, float] = config.drive.goal if d.frame == "map" else self._on_ground(*config.drive.goal)
         self.posed: list[int] = [0]
         self.true: dict[int, tuple[float, ...]] = {}
-        self.rows: dict[int, int] = {}
         self.scene = self.make.source(self.simulation.scene, "site")
         self.memory = PlannerMemory()
         self.pairs: list[Pair] = []
@@ -218,8 +217,8 @@ class Drive:
                 given = [*self.config.drive.goal, T_global_world[11]]
                 x, y, _ = RigidTransform.from_matrix(T_global_world).inverse().apply(given)
                 self.goal = self._on_ground(float(x), float(y))
-            yield from self._think(stop, self._map(stop))
-            way = yield from self._drive(stop, at)
+            plan = yield from self._think(stop, self._map(stop))
+            way = yield from self._drive(stop, at, plan)
             at = yield from self._judge(stop, way)
 
     # -- a stop -------------------------------------------------------------------------------------------------
@@ -325,8 +324,8 @@ class Drive:
         """The part of the world that is mapped."""
         return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
 
-    def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
-        """Plan the next leg; plan again while a way turns out to be closed."""
+    def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, Handle]:
+        """Plan the next leg, which is returned; plan again while a way turns out to be closed."""
         known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
         known |= {"before": self.planned, "driven": self.products.trajectory}
         follows, thoughts = "again", 0
@@ -343,6 +342,7 @@ class Drive:
             left = f"{1000 * leg['left_m']:.0f} mm from the goal"
             raise EndedError("stops", f"{count(stop.index + 1, 'stop')} and {left}")
         self.planned, stop.event = stop.leg, leg["reason"]
+        return stop.leg
 
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle | None) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
@@ -351,11 +351,10 @@ class Drive:
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
-    def _drive(self, stop: Stop, at: TrueStand) -> Generator[Wait, Any, Way]:
+    def _drive(self, stop: Stop, at: TrueStand, plan: Handle) -> Generator[Wait, Any, Way]:
         """True motion of a leg, measurements of its sensors, and the images on the way that are not lost."""
         k, s, make = stop.index, self.simulation, self.make
-        assert stop.leg is not None
-        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": stop.leg}
+        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": plan}
         change = s.change(k, at.row)
         if change is not None:
             given["scene"] = self.scene = make.source(change, f"obstacle/{k}", given)
@@ -372,7 +371,7 @@ class Drive:
             raise EndedError("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
         moved = yield [make.motion(a, b) for a, b in pairwise(rows)]
         kept = self._kept(stop, rows, [float(m.meta["match_rate"] or 0.0) for m in moved])
-        return Way(rows, kept, sense, said)
+        return Way(stop.drive, rows, kept, sense, said)
 
     def _kept(self, stop: Stop, rows: dict[int, int], rate: list[float]) -> list[int]:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
@@ -424,7 +423,6 @@ class Drive:
                 stop.row = rows[frames[-1]]
                 segment = self.make.segment(frames, key, which=f"{stop.frame}/stopped")
         stop.frames = frames
-        self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(segment.resection)
         self.posed += frames[1:]
         terminal = kind in ("attitude", "acceleration", "lost")
@@ -433,9 +431,8 @@ class Drive:
             # What was driven up to a safety stop belongs to the trajectory and to the assessment.
             self._located(len(self.driven.stops))
             raise EndedError("safety stop", reason + often)
-        assert stop.drive is not None
         end = frames[-1]
-        return TrueStand(end, stop.drive, rows[end], way.said.meta["up"][rows[end]])
+        return TrueStand(end, way.drive, rows[end], way.said.meta["up"][rows[end]])
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Compare the images on the way with the last model, for obstacles that it lacks."""
