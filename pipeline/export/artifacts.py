@@ -17,12 +17,6 @@ def used_rig(view: RunView, pair: int) -> Rig:
     return view.sequence.rig if bundle is None or "rig" not in bundle.meta else Rig.from_dict(bundle.meta["rig"])
 
 
-def image(view: RunView, frame: int) -> Bundle | None:
-    """The left image that was matched and tracked, free of distortion."""
-    ideal = view.bundle(view.products.undistorted.get(frame))
-    return ideal if ideal is not None else view.bundle(view.products.images.get(frame))
-
-
 def by_frame(view: RunView, bundle: Bundle, name: str) -> Floats:
     """An array of an artifact with one row for each chosen frame, NaN for frames without one."""
     values = np.asarray(bundle[name], dtype=np.float64)

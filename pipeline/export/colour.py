@@ -26,12 +26,12 @@ LUMA = np.array([0.299, 0.587, 0.114])
 def reads(run: RunView) -> tuple[object, ...]:
     """Inputs of the colours besides the merged terrain."""
     p = run.products
-    return p.images, p.undistorted, p.trajectory, p.rigs, run.sequence.rig
+    return p.images, p.trajectory, p.rigs, run.sequence.rig
 
 
 def coloured(view: RunView, source: NDArray[Any]) -> bool:
     """Whether any left image of the pairs in ``source`` has colours; a dark one may have none."""
-    images = (artifacts.image(view, int(pair)) for pair in np.unique(source))
+    images = (view.bundle(view.products.images.get(int(pair))) for pair in np.unique(source))
     return any(image is not None and "colour" in image.arrays for image in images)
 
 
@@ -50,7 +50,7 @@ def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -
     )
     xy = lattice.xy()
     for pair in np.unique(merged["source"][known]):
-        image, pose = artifacts.image(view, int(pair)), poses.get(int(pair))
+        image, pose = view.bundle(view.products.images.get(int(pair))), poses.get(int(pair))
         if image is None or "colour" not in image.arrays or pose is None or not np.isfinite(pose).all():
             continue
         here = known & (merged["source"] == pair) & np.isfinite(merged["elevation"])

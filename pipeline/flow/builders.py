@@ -26,6 +26,7 @@ from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, R
 from rille.stages.facts.imaging import PyramidFacts, QualityFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
+from rille.stages.geometry.geometry import Camera
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.features import features_stage
@@ -184,7 +185,7 @@ class Builder:
     @once
     def raw_image(self, frame: int, camera: str) -> Handle:
         """One image as the camera took it."""
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        ideal = self._ideal(camera)
         grey = 4.0 * ideal.width * ideal.height  # float32
         return self.source(self.sequence.image(frame, camera), f"image/{camera}/{frame}", expect=grey)
 
@@ -192,24 +193,24 @@ class Builder:
     def image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""
         image = self.raw_image(frame, camera)
+        lens = (self.sequence.lenses or {}).get(camera)
+        if lens is not None:
+            image = self.node(
+                undistort_stage,
+                f"undistort/{camera}/{frame}",
+                image=image,
+                lens=lens.to_dict(),
+                camera=self._ideal(camera).to_dict(),
+                frame=frame,
+                camera_name=camera,
+            )
         if camera == "left":
             self.products.images[frame] = image
-        lens = (self.sequence.lenses or {}).get(camera)
-        if lens is None:
-            return image
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
-        image = self.node(
-            undistort_stage,
-            f"undistort/{camera}/{frame}",
-            image=image,
-            lens=lens.to_dict(),
-            camera=ideal.to_dict(),
-            frame=frame,
-            camera_name=camera,
-        )
-        if camera == "left":
-            self.products.undistorted[frame] = image
         return image
+
+    def _ideal(self, camera: str) -> Camera:
+        """The ideal camera of a side."""
+        return self.sequence.rig.left if camera == "left" else self.sequence.rig.right
 
     @once
     def pyramid(self, frame: int, camera: str) -> Handle[PyramidFacts]:
@@ -267,8 +268,7 @@ class Builder:
     def _matched(self, label: str, pair: int, camera: str, other: str) -> Handle:
         """One task, or for a large pair tasks per level and tile that give the same artifact."""
         ports: dict[str, Handle] = {"left": self.pyramid(pair, camera), "right": self.pyramid(pair, other)}
-        cameras = {"left": self.sequence.rig.left, "right": self.sequence.rig.right}
-        first, second = ((cameras[name].height, cameras[name].width) for name in (camera, other))
+        first, second = ((ideal.height, ideal.width) for ideal in map(self._ideal, (camera, other)))
         side = tiles.side(self.config.tiling, self.config.hfvm, self.config.pyramid, (first, second))
         if side is None:
             # A smaller right image may be aligned to the left one, and is then as large.

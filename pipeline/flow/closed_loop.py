@@ -331,8 +331,8 @@ class Drive:
         follows, thoughts = "again", 0
         while follows == "again":
             label = f"leg/{stop.index}/{thoughts}" if thoughts else f"leg/{stop.index}"
-            stop.leg = self._leg(label, self.memory, {}, **known)
-            leg = (yield stop.leg).meta
+            plan = stop.leg = self._leg(label, self.memory, {}, **known)
+            leg = (yield plan).meta
             follows = self.memory.after(leg["verdict"], leg["where"] and tuple(leg["where"]))
             thoughts += 1
         if follows == "end":
@@ -341,8 +341,8 @@ class Drive:
         if stop.index + 1 >= self.config.drive.max_stops:
             left = f"{1000 * leg['left_m']:.0f} mm from the goal"
             raise EndedError("stops", f"{count(stop.index + 1, 'stop')} and {left}")
-        self.planned, stop.event = stop.leg, leg["reason"]
-        return stop.leg
+        self.planned, stop.event = plan, leg["reason"]
+        return plan
 
     def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle | None) -> Handle:
         args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
