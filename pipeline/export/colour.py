@@ -14,8 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from rille.pipeline.export import artifacts
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RunView, by_frame, used_rig
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
@@ -45,9 +44,7 @@ def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -
     grey, known = merged["ortho"], np.isfinite(merged["ortho"])
     colours = np.repeat(np.nan_to_num(grey)[..., None], 3, axis=2).astype(np.float64)
     trajectory = view.bundle(view.products.trajectory)
-    poses = (
-        {} if trajectory is None else dict(zip(view.frames, artifacts.by_frame(view, trajectory, "poses"), strict=True))
-    )
+    poses = {} if trajectory is None else dict(zip(view.frames, by_frame(view, trajectory, "poses"), strict=True))
     xy = lattice.xy()
     for pair in np.unique(merged["source"][known]):
         image, pose = view.bundle(view.products.images.get(int(pair))), poses.get(int(pair))
@@ -55,7 +52,7 @@ def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -
             continue
         here = known & (merged["source"] == pair) & np.isfinite(merged["elevation"])
         world = np.column_stack([xy[here], merged["elevation"][here]])
-        camera = artifacts.used_rig(view, int(pair)).left
+        camera = used_rig(view, int(pair)).left
         x, y = camera.project(RigidTransform.from_matrix(pose).inverse().apply(world)).T
         bands = np.moveaxis(image["colour"], 2, 0)
         colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)
