@@ -19,6 +19,7 @@ from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import Output, unpack
 from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import RunView, TaskRow
+from rille.pipeline.export.writers import write_json
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.report.page import write_report
@@ -91,7 +92,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, An
     meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
     vertical = "" if meta is None else meta["verticals"][meta["main"]]
     frames = catalogue.describe([p.name for p in folder.iterdir()], view, vertical)
-    atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
+    write_json(folder / "frames.json", frames)
     (facts,) = _files(made["facts"], store).values()
     figures = [
         FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made.get(o.name), store).values()

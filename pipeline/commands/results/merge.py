@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,9 +15,8 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
-from rille.pipeline.export.writers import Meaning, check_folder, write_raster
+from rille.pipeline.export.writers import Meaning, check_folder, write_json, write_raster
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
@@ -86,7 +84,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
     # First, since it marks the folder as ours, so that the same command can continue after a kill.
     facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
-    atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
+    write_json(output / "merge.json", facts)
     for name, band, values, unit in (
         ("dem.tif", "elevation", height, "m"),
         ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
