@@ -243,15 +243,12 @@ class Drive:
 
     def _fix(self) -> Handle[MapFixFacts]:
         """Pose of the first pair in the global map: as given, or by its elevation model."""
-        d, given = self.config.drive, dict[str, Any]()
+        d, given, overview = self.config.drive, dict[str, Any](), self.simulation.overview
         if d.pose is not None:
             given["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
-        else:
-            # Checked before the drive began.
-            assert d.prior is not None
-            assert self.simulation.overview is not None
-            overview = self.make.source(self.simulation.overview, "overview", {"scene": self.scene})
-            given["dem"], given["global_map"] = self.pairs[0].dem, overview
+        elif overview is not None:  # it and the prior were checked before the drive began
+            given["dem"] = self.pairs[0].dem
+            given["global_map"] = self.make.source(overview, "overview", {"scene": self.scene})
             given["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
             given["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
         self.driven.fix = self.make.node(map_localization_stage, "map_localization", **given)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS
+from rille.pipeline.export.programs.placed_pairs import placed_frames
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import frames_of
 from rille.stages.core.arrays import Bytes, Floats
@@ -24,7 +25,6 @@ from rille.stages.evaluation.crosscheck import colmap_rig
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
-from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import colours
 
 MAX_REPROJECTION_PX = 0.5
@@ -93,11 +93,7 @@ def build(
     """
     from rille.stages.geometry.colmap import pycolmap
 
-    poses = {
-        int(f): RigidTransform.from_matrix(pose)
-        for f, pose in zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
-        if np.isfinite(pose).all()
-    }
+    poses = placed_frames(trajectory)
     # Before images are made, since each point adds observations to them.
     seen: Seen = {(frame, side): [] for frame in poses for side in CAMERAS}
     points = [point for segment in segments for point in _points(segment, rig, poses, seen, images or {})]
