@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -113,32 +112,25 @@ class Builder:
     """Adds tasks of a sequence to a graph, with the parameters of a configuration.
 
     ``products`` are the handles that the report and the exporters read. Images, pyramids, motions and disparities are
-    made once, whoever asks for them.
+    made once, whoever asks for them. ``given_rig``, ``given_lenses`` (by camera; None: images are ideal) and
+    ``given_vehicle`` are arguments of stages.
     """
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
-        self.graph, self.sequence, self.config = graph, sequence, config
-        self.uncorrected = sequence
+        self.graph, self.config, self.uncorrected = graph, config, sequence
         self.correction: list[float] | None = None
         self.products = Products()
         self.made: dict[Any, Any] = {}
+        # Without its name, which changes no result.
+        self.given_vehicle = config.vehicle.model_dump(mode="json", exclude={"name"})
+        self._take(sequence)
 
-    # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
-
-    @cached_property
-    def given_rig(self) -> dict[str, Any]:
-        """The sequence's rig."""
-        return self.sequence.rig.to_dict()
-
-    @cached_property
-    def given_lenses(self) -> dict[str, Any] | None:
-        """The sequence's lenses by camera, None where its images are ideal."""
-        return {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()} or None
-
-    @cached_property
-    def given_vehicle(self) -> Any:
-        """The vehicle without its name, which changes no result."""
-        return self.config.vehicle.model_dump(mode="json", exclude={"name"})
+    def _take(self, sequence: Sequence) -> None:
+        """Lay out tasks of this sequence from now on."""
+        self.sequence = sequence
+        # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
+        self.given_rig = sequence.rig.to_dict()
+        self.given_lenses = {side: lens.to_dict() for side, lens in (sequence.lenses or {}).items()} or None
 
     def node(self, stage: Stage[Any, F], label: str, params: Any = None, /, **given: Any) -> Handle[F]:
         """One task of a stage, with the parameters that it has in the configuration, or with others.
@@ -150,10 +142,9 @@ class Builder:
 
     def recalibrate(self, correction: list[float], since: int) -> None:
         """Correct the calibration; tasks that do not depend on it are laid out as before."""
-        self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
+        self._take(recalibrated(self.uncorrected, correction))
+        self.correction = correction
         self.discard(since)
-        for cached in ("given_rig", "given_lenses"):
-            self.__dict__.pop(cached, None)
 
     def discard(self, since: int) -> None:
         """Mark the tasks from number ``since`` on as outdated, unless they are laid out again."""
