@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.plain import some
@@ -109,6 +110,11 @@ def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
     yield from sorted(before, key=lambda r: r.name, reverse=True)
 
 
+def tasks(run: Path) -> dict[str, dict[str, Any]]:
+    """Rows of a run's ledger by the label of their task."""
+    return {row["label"]: row for row in events.read(run / LEDGER)}
+
+
 def used(run: Path) -> set[str]:
     """Keys of all artifacts that a run used.
 
@@ -118,5 +124,5 @@ def used(run: Path) -> set[str]:
         Its ledger cannot be read.
     """
     with reading(run):
-        rows = (row for row in events.read(run / LEDGER) if row["status"] in ("computed", "cached"))
+        rows = (row for row in tasks(run).values() if row["status"] in ("computed", "cached"))
         return {str(row["key"]) for row in rows if "key" in row}
