@@ -69,12 +69,10 @@ def find(text: str, runs: Path) -> Path:
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()
-    for run in known:
-        if text in (run.name, name(run)):
+    # By its name alone, or the last one of a sequence none of whose runs has ended.
+    for run in reversed(known):
+        if text in (run.name, run.parent.name):
             return run.resolve()
-    started = [run for run in known if run.parent.name == text]
-    if started:  # none of them has ended
-        return started[-1].resolve()
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=did_you_mean(text, names) or where)
