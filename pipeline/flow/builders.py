@@ -300,19 +300,9 @@ class Builder:
 
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
         """
-        reference = level if first is None else first.level
-        seen = self._seen(frame)
-        dem = self.node(
-            locus_stage,
-            f"locus/local/{frame}",
-            **seen,
-            rig=known,
-            level=level,
-            reference=reference,
-            pair=frame,
-            frame="local",
-        )
-        return Pair(frame, self.disparity(frame), known, level, dem)
+        basic = BasicPair(frame, self.disparity(frame), known, level)
+        dem = self.products.local_dem[frame] = self._model("local", basic, (first or basic).level)
+        return Pair(frame, basic.disparity, known, level, dem)
 
     def world_model(
         self,
@@ -321,8 +311,8 @@ class Builder:
         row: int,
         trajectory: Handle[TrajectoryFacts],
         moving: Handle[MovingFacts] | None = None,
-    ) -> tuple[Handle, Handle[DemFacts]]:
-        """Pose and elevations of a pair straight on the world lattice: the pose in this row of the trajectory.
+    ) -> Handle:
+        """Elevations of a pair straight on the world lattice, by the pose in this row of the trajectory: that pose.
 
         The frame of pair ``first`` is the world; what is ``moving`` is left out.
         """
@@ -330,20 +320,17 @@ class Builder:
         at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row, **(chained or {}))
         # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
         # stays in the cache when only other poses move.
-        known = {"rig": pair.rig, "level": pair.level, "reference": first.level, "trajectory": at, "local": pair.dem}
-        label = f"locus/world/{pair.frame}"
-        return at, self.node(
-            locus_stage, label, **self._seen(pair.frame), **known, moving=moving, pair=pair.frame, frame="world", row=0
-        )
+        more = {"trajectory": at, "local": pair.dem, "moving": moving, "row": 0}
+        self.products.world_dem[pair.frame] = self._model("world", pair, first.level, **more)
+        return at
 
-    def _seen(self, frame: int) -> dict[str, Handle | None]:
-        """Images and disparity of a pair, and with ``locus.both`` the disparity of its right image."""
-        return {
-            "disparity": self.disparity(frame),
-            "left": self.pyramid(frame, "left"),
-            "right": self.pyramid(frame, "right"),
-            "back": self.backward(frame) if self.config.locus.both else None,
-        }
+    def _model(self, where: str, pair: BasicPair, reference: Handle[GroundFacts], **more: Any) -> Handle[DemFacts]:
+        """Elevations of a pair in its ``local`` frame or in the ``world``, above the plane of the ``reference``."""
+        given: dict[str, Any] = {camera: self.pyramid(pair.frame, camera) for camera in CAMERAS}
+        given["back"] = self.backward(pair.frame) if self.config.locus.both else None
+        given |= {"disparity": pair.disparity, "rig": pair.rig, "level": pair.level, "reference": reference}
+        label = f"locus/{where}/{pair.frame}"
+        return self.node(locus_stage, label, **given, pair=pair.frame, frame=where, **more)
 
     # -- between pairs ------------------------------------------------------------------------------------------
 

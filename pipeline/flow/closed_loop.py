@@ -239,7 +239,7 @@ class Drive(Builder):
             p.rigs[frame], known = p.rigs[0], self.pairs[0].rig
         level = self.level(frame, {"up": at.up}, known)
         pair = self.pair(frame, level, known, self.pairs[0] if self.pairs else None)
-        p.level[frame], p.local_dem[frame] = pair.level, pair.dem
+        p.level[frame] = level
         self.pairs.append(pair)
         return stop
 
@@ -272,7 +272,7 @@ class Drive(Builder):
         """Merge the models so far and judge their hazards; return the upper bounds of the ground."""
         p, k = self.products, stop.index
         found, row = self._located(k), len(self.posed) - 1
-        pose, p.world_dem[stop.frame] = self.world_model(self.pairs[k], self.pairs[0], row, found)
+        pose = self.world_model(self.pairs[k], self.pairs[0], row, found)
         self.poses.append(pose)
         if k == 0 and self.simulation.pad > 0:  # the ground under the vehicle, which no camera sees
             pad = self.node(
