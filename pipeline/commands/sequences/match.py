@@ -95,13 +95,11 @@ def match(
 @contextmanager
 def _progress(pixels: int) -> Iterator[Callable[[float, str], None]]:
     """Callback that shows share and step of a large match as a bar, if stderr is a terminal."""
-    # A megapixel or more: smaller images match in less than seconds.
-    if pixels < 1_000_000 or not sys.stderr.isatty():
-        yield lambda share, step: None
-        return
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(file=raw(sys.stderr)), transient=True) as bar:
+    # Images below a megapixel match in less than seconds.
+    disable = pixels < 1_000_000 or not sys.stderr.isatty()
+    with Progress(console=Console(file=raw(sys.stderr)), transient=True, disable=disable) as bar:
         task = bar.add_task("matching", total=1.0)
         yield lambda share, step: bar.update(task, completed=share, description=step)
