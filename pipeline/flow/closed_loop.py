@@ -330,7 +330,7 @@ class Drive(Builder):
         follows, thoughts = "again", 0
         while follows == "again":
             label = f"leg/{stop.index}/{thoughts}" if thoughts else f"leg/{stop.index}"
-            plan = stop.leg = self._leg(label, self.memory, {}, **known)
+            plan = stop.leg = self._leg(label, self.memory, **known)
             leg = (yield plan).meta
             follows = self.memory.after(leg["verdict"], leg["where"] and tuple(leg["where"]))
             thoughts += 1
@@ -343,10 +343,9 @@ class Drive(Builder):
         self.planned, stop.event = plan, leg["reason"]
         return plan
 
-    def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle | None) -> Handle:
-        args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
-        args |= {"closed": [list(p) for p in memory.closed]}
-        return self.node(local_planner_stage, label, rig=self.pairs[0].rig, **args, **more, **inputs)
+    def _leg(self, label: str, memory: PlannerMemory, **given: Any) -> Handle:
+        given |= {"goal": list(self.goal), "looks": memory.looks, "closed": [list(p) for p in memory.closed]}
+        return self.node(local_planner_stage, label, rig=self.pairs[0].rig, **given, **self.mounting)
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
@@ -474,7 +473,7 @@ class Drive(Builder):
         exact = self.source(source, "truth_dem", {"scene": self.scene})
         p.dem_accuracy = self.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
         true_risk = self.hazards("risk/truth", [exact])
-        best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=true_risk, pose=self.poses[0])
+        best = self._leg("leg/truth", PlannerMemory(), whole=True, risk=true_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 
     def _closed(self) -> str:
