@@ -261,7 +261,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / LEDGER,
-            progress=progress.make(options.progress),
+            progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             kept=kept,
         ),
