@@ -133,7 +133,9 @@ def used_rig(run: RunView, pair: int) -> Rig:
 
 def by_frame(run: RunView, bundle: Bundle, name: str) -> Floats:
     """An array of an artifact with one row for each chosen frame, NaN for frames without one."""
-    return rigid.by_frame(np.asarray(bundle[name], np.float64), list(bundle.meta["frames"]), list(run.frames))
+    values = np.asarray(bundle[name], dtype=np.float64)
+    frames = list(bundle.meta.get("frames") or run.frames[: len(values)])
+    return rigid.by_frame(values, frames, list(run.frames))
 
 
 def chain(run: RunView) -> tuple[int, ...]:
