@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any, Literal
@@ -18,6 +18,7 @@ import numpy as np
 import tomli_w
 from pydantic import Field, create_model
 
+from rille.datasets.protocol import Sequence
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.declare import Params, Stage, declared
 from rille.stages.core.errors import ConfigError
@@ -182,7 +183,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def refuse_other_sections(given: Iterable[str], own: Sequence[str], command: str) -> None:
+def refuse_other_sections(given: Iterable[str], own: tuple[str, ...], command: str) -> None:
     """Refuse sections that a command does not read.
 
     Raises
@@ -222,6 +223,12 @@ def build(*layers: Mapping[str, Any]) -> Params:
 def _preset(nested: Mapping[str, Any], section: str) -> Any:
     values = nested.get(section)
     return values.get("preset") if isinstance(values, Mapping) else None
+
+
+def suited(sequence: Sequence) -> dict[str, Any]:
+    """Parameters that suit a sequence, by section: its vehicle's limits, and defaults that it states."""
+    vehicle = {} if sequence.vehicle is None else {"vehicle": sequence.vehicle.model_dump(mode="json")}
+    return merge(vehicle, expand(sequence.defaults))
 
 
 def validate(kind: type[Model], values: Mapping[str, Any], section: str = "", also: Iterable[str] = ()) -> Model:

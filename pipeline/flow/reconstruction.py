@@ -513,8 +513,8 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
     """Local elevation models of stereo pairs on the lattice of the ``first``; on ground also risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
     for one in matched:
-        k, pair = one.frame, make.pair(one.frame, one.level, one.rig, first)
-        pairs[k] = pair
+        k = one.frame
+        pair = pairs[k] = make.pair(k, one.level, one.rig, first)
         if "reference" not in one.level.spec.args:
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
