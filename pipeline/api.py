@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from rille.datasets.text.reading import TABLE, read_lines, read_text
-from rille.pipeline.engine import events
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.runs import lookup
@@ -207,7 +206,7 @@ class Run:
         A task that this run computed has ``seconds`` and more of what it took, and ``reason``: why it was not cached.
         """
         with self._reading():
-            return list(events.read(self.folder / lookup.LEDGER))
+            return list(lookup.tasks(self.folder).values())
 
     @property
     def metrics(self) -> Mapping[str, Any]:

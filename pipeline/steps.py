@@ -138,9 +138,7 @@ class StereoPair:
     @property
     def settings(self) -> dict[str, Any]:
         """Parameters that suit the sequence, by section; what is given to a function wins."""
-        source = self.sequence.source
-        vehicle = {} if source.vehicle is None else {"vehicle": source.vehicle.model_dump(mode="json")}
-        return config.merge(vehicle, config.expand(source.defaults))
+        return config.suited(self.sequence.source)
 
     def _bundle(self, camera: str) -> Bundle:
         return _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)

@@ -68,7 +68,7 @@ def stone(flow: Any, store: Any) -> dict[str, Any]:
     radius = 1.2 * 0.5 * vehicle.wheel_diameter
     met = np.abs((away * ahead).sum(axis=1)) <= vehicle.half_length + radius
     met &= np.abs((away * right).sum(axis=1)) <= vehicle.half_width + radius
-    stopped = int(np.asarray(driven["frame_at"])[flow.rows[stop.frames[-1]]])
+    stopped = int(np.asarray(driven["frame_at"])[stop.row])
     contact = int(np.argmax(met)) if met.any() else None
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(trail[:, :2, 3], axis=0).T)))
     return {

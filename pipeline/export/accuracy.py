@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
+from rille.pipeline.export.writers import write_json
 
 
 def _write(path: Path, run: RunView) -> None:
@@ -23,8 +23,7 @@ def _write(path: Path, run: RunView) -> None:
     figures |= {name: one.meta["metrics"] for name, of in whole.items() if (one := run.bundle(of)) is not None}
     figures = {name: values for name, values in figures.items() if values}
     if figures:
-        text = json.dumps({"truth": run.sequence.truth_source, **figures}, indent=1, allow_nan=False)
-        path.write_text(text + "\n", encoding="utf-8")
+        write_json(path, {"truth": run.sequence.truth_source, **figures})
 
 
 def _reads(run: RunView) -> tuple[object, ...]:

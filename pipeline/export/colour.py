@@ -14,8 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from rille.pipeline.export import artifacts
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RunView, by_frame, used_rig
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
@@ -26,12 +25,12 @@ LUMA = np.array([0.299, 0.587, 0.114])
 def reads(run: RunView) -> tuple[object, ...]:
     """Inputs of the colours besides the merged terrain."""
     p = run.products
-    return p.images, p.undistorted, p.trajectory, p.rigs, run.sequence.rig
+    return p.images, p.trajectory, p.rigs, run.sequence.rig
 
 
 def coloured(view: RunView, source: NDArray[Any]) -> bool:
     """Whether any left image of the pairs in ``source`` has colours; a dark one may have none."""
-    images = (artifacts.image(view, int(pair)) for pair in np.unique(source))
+    images = (view.bundle(view.products.images.get(int(pair))) for pair in np.unique(source))
     return any(image is not None and "colour" in image.arrays for image in images)
 
 
@@ -45,17 +44,15 @@ def ortho(view: RunView, lattice: Lattice, merged: Mapping[str, NDArray[Any]]) -
     grey, known = merged["ortho"], np.isfinite(merged["ortho"])
     colours = np.repeat(np.nan_to_num(grey)[..., None], 3, axis=2).astype(np.float64)
     trajectory = view.bundle(view.products.trajectory)
-    poses = (
-        {} if trajectory is None else dict(zip(view.frames, artifacts.by_frame(view, trajectory, "poses"), strict=True))
-    )
+    poses = {} if trajectory is None else dict(zip(view.frames, by_frame(view, trajectory, "poses"), strict=True))
     xy = lattice.xy()
     for pair in np.unique(merged["source"][known]):
-        image, pose = artifacts.image(view, int(pair)), poses.get(int(pair))
+        image, pose = view.bundle(view.products.images.get(int(pair))), poses.get(int(pair))
         if image is None or "colour" not in image.arrays or pose is None or not np.isfinite(pose).all():
             continue
         here = known & (merged["source"] == pair) & np.isfinite(merged["elevation"])
         world = np.column_stack([xy[here], merged["elevation"][here]])
-        camera = artifacts.used_rig(view, int(pair)).left
+        camera = used_rig(view, int(pair)).left
         x, y = camera.project(RigidTransform.from_matrix(pose).inverse().apply(world)).T
         bands = np.moveaxis(image["colour"], 2, 0)
         colour = np.stack([scipy.ndimage.map_coordinates(b, (y, x), float, 1, mode="nearest") for b in bands], axis=1)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export.artifacts import by_frame
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RunView, by_frame
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.evaluation.agreement import carried

@@ -7,7 +7,12 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+import numpy as np
+
+from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
+from rille.stages.geometry import rigid
+from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:
     from rille.datasets.protocol import Sequence
@@ -118,6 +123,25 @@ def artifact(run: RunView, handle: Any) -> Bundle:
     bundle = run.bundle(handle)
     assert bundle is not None
     return bundle
+
+
+def used_rig(run: RunView, pair: int) -> Rig:
+    """The rig that a basic pair was reconstructed with; as given if no other is known."""
+    bundle = run.bundle(run.products.rigs.get(pair))
+    return run.sequence.rig if bundle is None or "rig" not in bundle.meta else Rig.from_dict(bundle.meta["rig"])
+
+
+def by_frame(run: RunView, bundle: Bundle, name: str) -> Floats:
+    """An array of an artifact with one row for each chosen frame, NaN for frames without one."""
+    values = np.asarray(bundle[name], dtype=np.float64)
+    frames = list(bundle.meta.get("frames") or run.frames[: len(values)])
+    return rigid.by_frame(values, frames, list(run.frames))
+
+
+def chain(run: RunView) -> tuple[int, ...]:
+    """Frames of the trajectory, in order; all chosen ones if there is no trajectory."""
+    bundle = run.bundle(run.products.screening)
+    return run.frames if bundle is None else tuple(int(f) for f in bundle.meta["chain"])
 
 
 def part(run: RunView, reads: Reads) -> RunView:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +22,6 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.plain import plain
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError
-from rille.stages.core.validity import Validity
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import NO_VERTICAL, REFERENCE_PLANE
 from rille.stages.geometry.rigid import posed
@@ -227,38 +227,13 @@ def _write_rows(path: Path, rows: NDArray[np.float64], form: str | list[str] = "
     atomic.write(path, out.getvalue())
 
 
-def write_disparity(path: Path, column: NDArray[Any], row: NDArray[Any], tags: Mapping[str, str]) -> None:
-    """Write the disparity of two images as a float32 TIFF: bands ``column_disparity`` and ``row_disparity``.
-
-    Parameters
-    ----------
-    column, row : (row, col) pixels on the left image, right minus left, NaN undefined.
-    tags : more metadata.
-    """
-    tags = {"convention": "right minus left, pixels of the left image, NaN undefined", **tags}
-    _write_image(path, {"column_disparity": column, "row_disparity": row}, Meaning("pixel", tags=tags))
-
-
-def write_confidence(
-    path: Path, std: NDArray[Any], validity: NDArray[Any], backmatch_error: NDArray[Any], tags: Mapping[str, str]
-) -> None:
-    """Write bands ``disparity_std``, ``validity``, ``backmatch_error`` of a disparity as a float32 TIFF.
-
-    Parameters
-    ----------
-    std, backmatch_error : (row, col) pixels, NaN undefined.
-    validity : (row, col) uint8, bits of :class:`rille.stages.core.validity.Validity`, as described in the tag
-        ``VALIDITY``.
-    tags : more metadata.
-    """
-    bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
-    units = {"disparity_std": "pixel", "validity": "", "backmatch_error": "pixel"}
-    bands = dict(zip(units, (std, validity, backmatch_error), strict=True))
-    _write_image(path, bands, Meaning(units, tags={"validity": f"sum of {bits}", **tags}))
-
-
-def _write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning) -> None:
+def write_image(path: Path, bands: Mapping[str, NDArray[Any]], meaning: Meaning) -> None:
     """Write arrays (row, col) on image pixels as bands of a float32 TIFF, NaN undefined."""
     # 3: predictor for floats, which GTiff, unlike COG, does not choose.
     profile = {"driver": "GTiff", "predictor": 3}
     write_bands(path, {n: np.asarray(v, np.float32) for n, v in bands.items()}, meaning, profile)
+
+
+def write_json(path: Path, facts: Mapping[str, Any]) -> None:
+    """Write facts for programs; a number that is not finite is an error."""
+    atomic.write(path, json.dumps(facts, indent=1, allow_nan=False) + "\n")

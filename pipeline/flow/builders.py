@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -26,6 +25,7 @@ from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, R
 from rille.stages.facts.imaging import PyramidFacts, QualityFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
 from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
+from rille.stages.geometry.geometry import Camera
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
 from rille.stages.imaging.features import features_stage
@@ -112,32 +112,25 @@ class Builder:
     """Adds tasks of a sequence to a graph, with the parameters of a configuration.
 
     ``products`` are the handles that the report and the exporters read. Images, pyramids, motions and disparities are
-    made once, whoever asks for them.
+    made once, whoever asks for them. ``given_rig``, ``given_lenses`` (by camera; None: images are ideal) and
+    ``given_vehicle`` are arguments of stages.
     """
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
-        self.graph, self.sequence, self.config = graph, sequence, config
-        self.uncorrected = sequence
+        self.graph, self.config, self.uncorrected = graph, config, sequence
         self.correction: list[float] | None = None
         self.products = Products()
         self.made: dict[Any, Any] = {}
+        # Without its name, which changes no result.
+        self.given_vehicle = config.vehicle.model_dump(mode="json", exclude={"name"})
+        self._take(sequence)
 
-    # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
-
-    @cached_property
-    def given_rig(self) -> dict[str, Any]:
-        """The sequence's rig."""
-        return self.sequence.rig.to_dict()
-
-    @cached_property
-    def given_lenses(self) -> dict[str, Any] | None:
-        """The sequence's lenses by camera, None where its images are ideal."""
-        return {side: lens.to_dict() for side, lens in (self.sequence.lenses or {}).items()} or None
-
-    @cached_property
-    def given_vehicle(self) -> Any:
-        """The vehicle without its name, which changes no result."""
-        return self.config.vehicle.model_dump(mode="json", exclude={"name"})
+    def _take(self, sequence: Sequence) -> None:
+        """Lay out tasks of this sequence from now on."""
+        self.sequence = sequence
+        # Arguments of many tasks, one object for all: each would hold some kilobytes of its own until the run's end.
+        self.given_rig = sequence.rig.to_dict()
+        self.given_lenses = {side: lens.to_dict() for side, lens in (sequence.lenses or {}).items()} or None
 
     def node(self, stage: Stage[Any, F], label: str, params: Any = None, /, **given: Any) -> Handle[F]:
         """One task of a stage, with the parameters that it has in the configuration, or with others.
@@ -149,10 +142,9 @@ class Builder:
 
     def recalibrate(self, correction: list[float], since: int) -> None:
         """Correct the calibration; tasks that do not depend on it are laid out as before."""
-        self.sequence, self.correction = recalibrated(self.uncorrected, correction), correction
+        self._take(recalibrated(self.uncorrected, correction))
+        self.correction = correction
         self.discard(since)
-        for cached in ("given_rig", "given_lenses"):
-            self.__dict__.pop(cached, None)
 
     def discard(self, since: int) -> None:
         """Mark the tasks from number ``since`` on as outdated, unless they are laid out again."""
@@ -184,7 +176,7 @@ class Builder:
     @once
     def raw_image(self, frame: int, camera: str) -> Handle:
         """One image as the camera took it."""
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
+        ideal = self._ideal(camera)
         grey = 4.0 * ideal.width * ideal.height  # float32
         return self.source(self.sequence.image(frame, camera), f"image/{camera}/{frame}", expect=grey)
 
@@ -192,24 +184,24 @@ class Builder:
     def image(self, frame: int, camera: str) -> Handle:
         """One image as an ideal camera would have taken it."""
         image = self.raw_image(frame, camera)
+        lens = (self.sequence.lenses or {}).get(camera)
+        if lens is not None:
+            image = self.node(
+                undistort_stage,
+                f"undistort/{camera}/{frame}",
+                image=image,
+                lens=lens.to_dict(),
+                camera=self._ideal(camera).to_dict(),
+                frame=frame,
+                camera_name=camera,
+            )
         if camera == "left":
             self.products.images[frame] = image
-        lens = (self.sequence.lenses or {}).get(camera)
-        if lens is None:
-            return image
-        ideal = self.sequence.rig.left if camera == "left" else self.sequence.rig.right
-        image = self.node(
-            undistort_stage,
-            f"undistort/{camera}/{frame}",
-            image=image,
-            lens=lens.to_dict(),
-            camera=ideal.to_dict(),
-            frame=frame,
-            camera_name=camera,
-        )
-        if camera == "left":
-            self.products.undistorted[frame] = image
         return image
+
+    def _ideal(self, camera: str) -> Camera:
+        """The ideal camera of a side."""
+        return self.sequence.rig.left if camera == "left" else self.sequence.rig.right
 
     @once
     def pyramid(self, frame: int, camera: str) -> Handle[PyramidFacts]:
@@ -267,8 +259,7 @@ class Builder:
     def _matched(self, label: str, pair: int, camera: str, other: str) -> Handle:
         """One task, or for a large pair tasks per level and tile that give the same artifact."""
         ports: dict[str, Handle] = {"left": self.pyramid(pair, camera), "right": self.pyramid(pair, other)}
-        cameras = {"left": self.sequence.rig.left, "right": self.sequence.rig.right}
-        first, second = ((cameras[name].height, cameras[name].width) for name in (camera, other))
+        first, second = ((ideal.height, ideal.width) for ideal in map(self._ideal, (camera, other)))
         side = tiles.side(self.config.tiling, self.config.hfvm, self.config.pyramid, (first, second))
         if side is None:
             # A smaller right image may be aligned to the left one, and is then as large.
@@ -309,19 +300,9 @@ class Builder:
 
         Cells and extent of the ``first`` pair (None: this one) serve all, so that they merge.
         """
-        reference = level if first is None else first.level
-        seen = self._seen(frame)
-        dem = self.node(
-            locus_stage,
-            f"locus/local/{frame}",
-            **seen,
-            rig=known,
-            level=level,
-            reference=reference,
-            pair=frame,
-            frame="local",
-        )
-        return Pair(frame, self.disparity(frame), known, level, dem)
+        basic = BasicPair(frame, self.disparity(frame), known, level)
+        dem = self.products.local_dem[frame] = self._model("local", basic, (first or basic).level)
+        return Pair(frame, basic.disparity, known, level, dem)
 
     def world_model(
         self,
@@ -330,8 +311,8 @@ class Builder:
         row: int,
         trajectory: Handle[TrajectoryFacts],
         moving: Handle[MovingFacts] | None = None,
-    ) -> tuple[Handle, Handle[DemFacts]]:
-        """Pose and elevations of a pair straight on the world lattice: the pose in this row of the trajectory.
+    ) -> Handle:
+        """Elevations of a pair straight on the world lattice, by the pose in this row of the trajectory: that pose.
 
         The frame of pair ``first`` is the world; what is ``moving`` is left out.
         """
@@ -339,20 +320,17 @@ class Builder:
         at = self.node(pose_stage, f"pose/{pair.frame}", trajectory=trajectory, row=row, **(chained or {}))
         # Row 0 of the artifact of `pose`, which holds one: so an elevation model depends on its own pose alone, and
         # stays in the cache when only other poses move.
-        known = {"rig": pair.rig, "level": pair.level, "reference": first.level, "trajectory": at, "local": pair.dem}
-        label = f"locus/world/{pair.frame}"
-        return at, self.node(
-            locus_stage, label, **self._seen(pair.frame), **known, moving=moving, pair=pair.frame, frame="world", row=0
-        )
+        more = {"trajectory": at, "local": pair.dem, "moving": moving, "row": 0}
+        self.products.world_dem[pair.frame] = self._model("world", pair, first.level, **more)
+        return at
 
-    def _seen(self, frame: int) -> dict[str, Handle | None]:
-        """Images and disparity of a pair, and with ``locus.both`` the disparity of its right image."""
-        return {
-            "disparity": self.disparity(frame),
-            "left": self.pyramid(frame, "left"),
-            "right": self.pyramid(frame, "right"),
-            "back": self.backward(frame) if self.config.locus.both else None,
-        }
+    def _model(self, where: str, pair: BasicPair, reference: Handle[GroundFacts], **more: Any) -> Handle[DemFacts]:
+        """Elevations of a pair in its ``local`` frame or in the ``world``, above the plane of the ``reference``."""
+        given: dict[str, Any] = {camera: self.pyramid(pair.frame, camera) for camera in CAMERAS}
+        given["back"] = self.backward(pair.frame) if self.config.locus.both else None
+        given |= {"disparity": pair.disparity, "rig": pair.rig, "level": pair.level, "reference": reference}
+        label = f"locus/{where}/{pair.frame}"
+        return self.node(locus_stage, label, **given, pair=pair.frame, frame=where, **more)
 
     # -- between pairs ------------------------------------------------------------------------------------------
 

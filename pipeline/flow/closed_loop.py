@@ -127,8 +127,9 @@ class TrueStand:
 
 @dataclass(frozen=True)
 class Way:
-    """Record of a leg: row of each frame in the leg's artifact, frames that are not lost, and what sensors said."""
+    """Record of a leg: its artifact ``drive``, row of each frame there, frames that are not lost, what sensors said."""
 
+    drive: Handle
     rows: dict[int, int]
     frames: list[int]
     sense: Handle
@@ -139,8 +140,8 @@ class EndedError(Exception):
     """The drive is over: verdict and reason."""
 
 
-class Drive:
-    """A drive that is laid out stop by stop, as results arrive.
+class Drive(Builder):
+    """A drive that is laid out stop by stop, as results arrive: an ideal camera takes each image from the true pose.
 
     Attributes
     ----------
@@ -148,7 +149,6 @@ class Drive:
     posed : frames of the trajectory so far.
     goal : m, world frame.
     true : true pose of each frame that was taken; read by the renderer and by what assesses, never by an estimate.
-    rows : row of each frame in the artifact of its leg.
     """
 
     def __init__(self, graph: Graph, sequence: Sequence, config: Any) -> None:
@@ -163,23 +163,25 @@ class Drive:
             text = "drive.frame=map needs drive.pose, or drive.prior and a global map"
             remedy = "set drive.pose=[x, y, z, degrees], or drive.prior and rover.map_cell"
             raise ConfigError("RIL-033", text, remedy=remedy)
-        self.graph, self.sequence, self.config = graph, sequence, config
-        self.make = DriveBuilder(graph, sequence, config, self)
-        self.products = self.make.products
+        super().__init__(graph, sequence, config)
         self.driven = self.products.drive = Driven()
         self.simulation: Simulation = sequence.simulation
         self.mounting = {"T_vehicle_left": self.simulation.T_vehicle_left.to_list()}
         self.goal: tuple[float, float] = config.drive.goal if d.frame == "map" else self._on_ground(*config.drive.goal)
         self.posed: list[int] = [0]
         self.true: dict[int, tuple[float, ...]] = {}
-        self.rows: dict[int, int] = {}
-        self.scene = self.make.source(self.simulation.scene, "site")
+        self.scene = self.source(self.simulation.scene, "site")
         self.memory = PlannerMemory()
         self.pairs: list[Pair] = []
         self.poses: list[Handle] = []
         self.pads: list[Handle] = []
         self.planned: Handle | None = None
         self.troubles = 0
+
+    def raw_image(self, frame: int, camera: str) -> Handle:
+        """One image of the scene as it is now, from the true pose of the frame."""
+        source = self.simulation.image(frame, camera, RigidTransform.from_matrix(self.true[frame]))
+        return self.source(source, f"image/{camera}/{frame}", {"scene": self.scene})
 
     def steps(self) -> Generator[Wait, Any, None]:
         """The drive, and its assessment."""
@@ -203,11 +205,10 @@ class Drive:
         EndedError
             It is over.
         """
-        make, scene = self.make, self.scene
-        place = self.driven.place = make.source(
-            self.simulation.place(self.config.vehicle), "drive/start", {"scene": scene}
+        place = self.driven.place = self.source(
+            self.simulation.place(self.config.vehicle), "drive/start", {"scene": self.scene}
         )
-        there, said = yield [place, make.source(self.simulation.sense(-1), "sense/start", {"drive": place})]
+        there, said = yield [place, self.source(self.simulation.sense(-1), "sense/start", {"drive": place})]
         self.true[0] = tuple(there.meta["poses"][0])
         at = TrueStand(0, place, 0, said.meta["up"][0])
         while True:
@@ -218,44 +219,41 @@ class Drive:
                 given = [*self.config.drive.goal, T_global_world[11]]
                 x, y, _ = RigidTransform.from_matrix(T_global_world).inverse().apply(given)
                 self.goal = self._on_ground(float(x), float(y))
-            yield from self._think(stop, self._map(stop))
-            way = yield from self._drive(stop, at)
+            plan = yield from self._think(stop, self._map(stop))
+            way = yield from self._drive(stop, at, plan)
             at = yield from self._judge(stop, way)
 
     # -- a stop -------------------------------------------------------------------------------------------------
 
     def _look(self, at: TrueStand) -> Stop:
         """Stereo pair to local model."""
-        p, make, frame = self.products, self.make, at.frame
+        p, frame = self.products, at.frame
         stop = Stop(len(self.driven.stops), frame)
         self.driven.stops.append(stop)
-        p.disparity[frame] = make.disparity(frame)
+        p.disparity[frame] = self.disparity(frame)
         if stop.index == 0:
-            p.orientations[frame] = make.orientation(frame)
-            p.rigs[frame], known = make.rig([frame], f"/{frame}" if self.config.rig.mode == "per_pair" else "")
+            p.orientations[frame] = self.orientation(frame)
+            p.rigs[frame], known = self.rig([frame], f"/{frame}" if self.config.rig.mode == "per_pair" else "")
         else:
             # One rig for the drive, that of the first pair: cameras do not move against each other on the way.
             p.rigs[frame], known = p.rigs[0], self.pairs[0].rig
-        level = make.level(frame, {"up": at.up}, known)
-        pair = make.pair(frame, level, known, self.pairs[0] if self.pairs else None)
-        p.level[frame], p.local_dem[frame] = pair.level, pair.dem
+        level = self.level(frame, {"up": at.up}, known)
+        pair = self.pair(frame, level, known, self.pairs[0] if self.pairs else None)
+        p.level[frame] = level
         self.pairs.append(pair)
         return stop
 
     def _fix(self) -> Handle[MapFixFacts]:
         """Pose of the first pair in the global map: as given, or by its elevation model."""
-        d, given = self.config.drive, dict[str, Any]()
+        d, given, overview = self.config.drive, dict[str, Any](), self.simulation.overview
         if d.pose is not None:
             given["pose"] = [*d.pose[:3], math.radians(d.pose[3])]
-        else:
-            # Checked before the drive began.
-            assert d.prior is not None
-            assert self.simulation.overview is not None
-            overview = self.make.source(self.simulation.overview, "overview", {"scene": self.scene})
-            given["dem"], given["global_map"] = self.pairs[0].dem, overview
+        elif overview is not None:  # it and the prior were checked before the drive began
+            given["dem"] = self.pairs[0].dem
+            given["global_map"] = self.source(overview, "overview", {"scene": self.scene})
             given["prior"] = [*d.prior[:2], math.radians(d.prior[2])]
             given["prior_sigma"] = [d.prior_sigma[0], math.radians(d.prior_sigma[1])]
-        self.driven.fix = self.make.node(map_localization_stage, "map_localization", **given)
+        self.driven.fix = self.node(map_localization_stage, "map_localization", **given)
         return self.driven.fix
 
     def _on_ground(self, x: float, y: float) -> tuple[float, float]:
@@ -272,12 +270,12 @@ class Drive:
 
     def _map(self, stop: Stop) -> Handle:
         """Merge the models so far and judge their hazards; return the upper bounds of the ground."""
-        p, make, k = self.products, self.make, stop.index
+        p, k = self.products, stop.index
         found, row = self._located(k), len(self.posed) - 1
-        pose, p.world_dem[stop.frame] = make.world_model(self.pairs[k], self.pairs[0], row, found)
+        pose = self.world_model(self.pairs[k], self.pairs[0], row, found)
         self.poses.append(pose)
         if k == 0 and self.simulation.pad > 0:  # the ground under the vehicle, which no camera sees
-            pad = make.node(
+            pad = self.node(
                 start_area_stage,
                 "start_area",
                 pose=pose,
@@ -290,23 +288,23 @@ class Drive:
         # Two maps: of all that was seen, to plan far ahead, and of what was seen finely enough to drive on.
         near, finest = self._merged(f"merge/{k}", None), None
         p.world_tiles = [near]
-        stop.risk = p.world_risk = make.hazards(f"risk/{k}", [near])
+        stop.risk = p.world_risk = self.hazards(f"risk/{k}", [near])
         if self.config.drive.detail > 0:
             stop.far = stop.risk
             finest = self.config.vehicle.wheel_diameter / self.config.drive.detail
             near = self._merged(f"merge/{k}/near", finest)
-            stop.risk = make.hazards(f"risk/{k}/near", [near])
+            stop.risk = self.hazards(f"risk/{k}/near", [near])
         # Also where it was not seen.
         bounds = self.config.occlusion_bounds
         bounds = bounds if finest is None else bounds.model_copy(update={"max_footprint": finest})
         dems = list(p.world_dem.values())
-        return make.node(occlusion_bounds_stage, f"occlusion_bounds/{k}", bounds, merged=near, dems=dems)
+        return self.node(occlusion_bounds_stage, f"occlusion_bounds/{k}", bounds, merged=near, dems=dems)
 
     def _located(self, legs: int) -> Handle[TrajectoryFacts]:
         """The trajectory over so many legs, which becomes that of the drive."""
         p = self.products
         levels = [pair.level for pair in self.pairs]
-        found = p.trajectory = self.make.node(
+        found = p.trajectory = self.node(
             trajectory_stage,
             f"trajectory/{legs}",
             frames=list(self.posed),
@@ -319,21 +317,21 @@ class Drive:
         """All models so far, merged; with ``finest`` only ground of which a pixel covers at most so many metres."""
         params = self.config.merge.model_copy(update={} if finest is None else {"max_footprint": finest})
         dems = [*self.pads, *self.products.world_dem.values()]
-        return self.make.node(merge_stage, label, params, dems=dems, lattice=self.arena().to_dict())
+        return self.node(merge_stage, label, params, dems=dems, lattice=self.arena().to_dict())
 
     def arena(self) -> Lattice:
         """The part of the world that is mapped."""
         return arena(self.goal, self.config.drive.around, self.config.locus.cell_size)
 
-    def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, None]:
-        """Plan the next leg; plan again while a way turns out to be closed."""
+    def _think(self, stop: Stop, ceiling: Handle) -> Generator[Wait, Any, Handle]:
+        """Plan the next leg, which is returned; plan again while a way turns out to be closed."""
         known = {"risk": stop.risk, "far": stop.far, "ceiling": ceiling, "pose": self.poses[-1]}
         known |= {"before": self.planned, "driven": self.products.trajectory}
         follows, thoughts = "again", 0
         while follows == "again":
             label = f"leg/{stop.index}/{thoughts}" if thoughts else f"leg/{stop.index}"
-            stop.leg = self._leg(label, self.memory, {}, **known)
-            leg = (yield stop.leg).meta
+            plan = stop.leg = self._leg(label, self.memory, **known)
+            leg = (yield plan).meta
             follows = self.memory.after(leg["verdict"], leg["where"] and tuple(leg["where"]))
             thoughts += 1
         if follows == "end":
@@ -342,37 +340,36 @@ class Drive:
         if stop.index + 1 >= self.config.drive.max_stops:
             left = f"{1000 * leg['left_m']:.0f} mm from the goal"
             raise EndedError("stops", f"{count(stop.index + 1, 'stop')} and {left}")
-        self.planned, stop.event = stop.leg, leg["reason"]
+        self.planned, stop.event = plan, leg["reason"]
+        return plan
 
-    def _leg(self, label: str, memory: PlannerMemory, more: dict[str, Any], **inputs: Handle | None) -> Handle:
-        args: dict[str, Any] = {"goal": list(self.goal), "looks": memory.looks, **self.mounting}
-        args |= {"closed": [list(p) for p in memory.closed]}
-        return self.make.node(local_planner_stage, label, rig=self.pairs[0].rig, **args, **more, **inputs)
+    def _leg(self, label: str, memory: PlannerMemory, **given: Any) -> Handle:
+        given |= {"goal": list(self.goal), "looks": memory.looks, "closed": [list(p) for p in memory.closed]}
+        return self.node(local_planner_stage, label, rig=self.pairs[0].rig, **given, **self.mounting)
 
     # -- a leg --------------------------------------------------------------------------------------------------
 
-    def _drive(self, stop: Stop, at: TrueStand) -> Generator[Wait, Any, Way]:
+    def _drive(self, stop: Stop, at: TrueStand, plan: Handle) -> Generator[Wait, Any, Way]:
         """True motion of a leg, measurements of its sensors, and the images on the way that are not lost."""
-        k, s, make = stop.index, self.simulation, self.make
-        assert stop.leg is not None
-        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": stop.leg}
+        k, s = stop.index, self.simulation
+        given = {"scene": self.scene, "before": at.before, "pose": self.poses[-1], "plan": plan}
         change = s.change(k, at.row)
         if change is not None:
-            given["scene"] = self.scene = make.source(change, f"obstacle/{k}", given)
-        stop.drive = make.source(s.drive(self.config.vehicle, k, at.row), f"drive/{k}", given)
-        sense = make.source(s.sense(k), f"sense/{k}", {"drive": stop.drive})
+            given["scene"] = self.scene = self.source(change, f"obstacle/{k}", given)
+        stop.drive = self.source(s.drive(self.config.vehicle, k, at.row), f"drive/{k}", given)
+        sense = self.source(s.sense(k), f"sense/{k}", {"drive": stop.drive})
         there, said = yield [stop.drive, sense]
         first = max(self.true) + 1
         rows = {stop.frame: 0}
         for row, pose in enumerate(there.meta["poses"][1:], start=1):
             frame = first + row - 1
             self.true[frame], rows[frame] = tuple(pose), row
-            make.pyramid(frame, "left")
+            self.pyramid(frame, "left")
         if len(rows) < 2:
             raise EndedError("safety stop", "the rover did not move: it stands at the edge of the simulated bed")
-        moved = yield [make.motion(a, b) for a, b in pairwise(rows)]
+        moved = yield [self.motion(a, b) for a, b in pairwise(rows)]
         kept = self._kept(stop, rows, [float(m.meta["match_rate"] or 0.0) for m in moved])
-        return Way(rows, kept, sense, said)
+        return Way(stop.drive, rows, kept, sense, said)
 
     def _kept(self, stop: Stop, rows: dict[int, int], rate: list[float]) -> list[int]:
         """Leave lost images out; where two in a row are lost, or the last one, the vehicle stops and looks again."""
@@ -391,21 +388,21 @@ class Drive:
                 again = max(self.true) + 1
                 self.true[again], rows[again] = self.true[end], rows[end]
                 stop.event = f"lost image {shares}: stopped and taken again as image {again}"
-                self.make.pyramid(again, "left")
+                self.pyramid(again, "left")
                 frames.append(again)
         return [f for f in frames if f not in lost]
 
     def _judge(self, stop: Stop, way: Way) -> Generator[Wait, Any, TrueStand]:
         """Track and resect the images of a leg, up to its end, a safety stop or an obstacle; return where it ended."""
         frames, rows, key = way.frames, way.rows, self.pairs[-1]
-        segment = self.make.segment(frames, key)
-        safe = self.make.node(
+        segment = self.segment(frames, key)
+        safe = self.node(
             fault_monitor_stage,
             f"fault_monitor/{stop.index}",
             sense=way.sense,
             resect=segment.resection,
             rows=[rows[f] for f in frames],
-            vehicle=self.make.given_vehicle,
+            vehicle=self.given_vehicle,
             **self.mounting,
         )
         watched = [self._obstacles(stop, way, segment, key)] if self.config.obstacle_monitor.enabled else []
@@ -422,9 +419,8 @@ class Drive:
             if cut < len(frames) - 1:
                 frames = frames[: cut + 1]
                 stop.row = rows[frames[-1]]
-                segment = self.make.segment(frames, key, which=f"{stop.frame}/stopped")
+                segment = self.segment(frames, key, which=f"{stop.frame}/stopped")
         stop.frames = frames
-        self.rows |= {f: rows[f] for f in frames[1:]}
         self.products.resections.append(segment.resection)
         self.posed += frames[1:]
         terminal = kind in ("attitude", "acceleration", "lost")
@@ -433,9 +429,8 @@ class Drive:
             # What was driven up to a safety stop belongs to the trajectory and to the assessment.
             self._located(len(self.driven.stops))
             raise EndedError("safety stop", reason + often)
-        assert stop.drive is not None
         end = frames[-1]
-        return TrueStand(end, stop.drive, rows[end], way.said.meta["up"][rows[end]])
+        return TrueStand(end, way.drive, rows[end], way.said.meta["up"][rows[end]])
 
     def _obstacles(self, stop: Stop, way: Way, segment: Segment, key: Pair) -> Handle:
         """Compare the images on the way with the last model, for obstacles that it lacks."""
@@ -445,9 +440,9 @@ class Drive:
         params = self.config.motion.model_copy(update={"level": obstacle_monitor.LEVEL})
         motions = []
         for a, b in ((frames[i], frames[j]) for i, j in compared):
-            images = {"a": self.make.pyramid(a, "left"), "b": self.make.pyramid(b, "left")}
-            motions.append(self.make.node(motion_stage, f"motion/way/{a}-{b}", params, **images))
-        return self.make.node(
+            images = {"a": self.pyramid(a, "left"), "b": self.pyramid(b, "left")}
+            motions.append(self.node(motion_stage, f"motion/way/{a}-{b}", params, **images))
+        return self.node(
             obstacle_monitor_stage,
             f"obstacle_monitor/{stop.index}",
             dem=key.dem,
@@ -455,7 +450,7 @@ class Drive:
             rig=key.rig,
             motions=motions,
             pairs=[list(c) for c in compared],
-            vehicle=self.make.given_vehicle,
+            vehicle=self.given_vehicle,
             **self.mounting,
         )
 
@@ -463,22 +458,22 @@ class Drive:
 
     def _assess(self) -> Generator[Wait, Any, None]:
         """Compare the drive with the truth; nothing else compares them."""
-        p, make = self.products, self.make
+        p = self.products
         if not self.pairs or p.trajectory is None or _failed(self.pairs[0].level) or _failed(p.trajectory):
             p.trajectory = None  # it failed at its first stop
             self._check({})
             return
         true, frames = [list(self.true[f]) for f in self.posed], list(self.posed)
-        p.accuracy = make.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true, frames=frames)
+        p.accuracy = self.node(accuracy_stage, "accuracy", trajectory=p.trajectory, truth=true, frames=frames)
         level = yield from done(self.pairs[0].level)
         T_left_local = RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
         T_truth_world = RigidTransform.from_matrix(self.true[0]) @ T_left_local
         stops = [RigidTransform.from_matrix(self.true[stop.frame]) for stop in self.driven.stops]
         source = self.simulation.truth_dem(self.arena().to_dict(), T_truth_world, stops)
-        exact = make.source(source, "truth_dem", {"scene": self.scene})
-        p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
-        true_risk = make.hazards("risk/truth", [exact])
-        best = self._leg("leg/truth", PlannerMemory(), {"whole": True}, risk=true_risk, pose=self.poses[0])
+        exact = self.source(source, "truth_dem", {"scene": self.scene})
+        p.dem_accuracy = self.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
+        true_risk = self.hazards("risk/truth", [exact])
+        best = self._leg("leg/truth", PlannerMemory(), whole=True, risk=true_risk, pose=self.poses[0])
         self._check({"trajectory": p.trajectory, "truth": true, "best": best})
 
     def _closed(self) -> str:
@@ -491,12 +486,12 @@ class Drive:
         d = self.driven
         legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]
         assert d.place is not None
-        d.check = self.make.node(
+        d.check = self.node(
             drive_check_stage,
             "drive_check",
             drives=[d.place, *(drive for _, drive in legs)],
             rows=[0, *(row for row, _ in legs)],
-            vehicle=self.make.given_vehicle,
+            vehicle=self.given_vehicle,
             **known,
         )
 
@@ -515,20 +510,6 @@ class Drive:
         truth = tuple(RigidTransform.from_matrix(self.true[f]) if f in self.true else None for f in range(n))
         names = tuple(f"{f:06d}" for f in range(n))
         return replace(self.sequence, frames=n, frame_names=names, truth=truth), tuple(self.posed)
-
-
-class DriveBuilder(Builder):
-    """Tasks of a drive: an ideal camera takes each image from the true pose of the vehicle."""
-
-    def __init__(self, graph: Graph, sequence: Sequence, config: Any, drive: Drive) -> None:
-        super().__init__(graph, sequence, config)
-        self.drive = drive
-
-    def raw_image(self, frame: int, camera: str) -> Handle:
-        """One image of the scene as it is now, from the true pose of the frame."""
-        pose = RigidTransform.from_matrix(self.drive.true[frame])
-        source = self.drive.simulation.image(frame, camera, pose)
-        return self.source(source, f"image/{camera}/{frame}", {"scene": self.drive.scene})
 
 
 def _failed(handle: Handle) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any, Literal
@@ -18,36 +18,38 @@ import numpy as np
 import tomli_w
 from pydantic import Field, create_model
 
+from rille.datasets.protocol import Sequence
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.declare import Params, Stage, declared
 from rille.stages.core.errors import ConfigError
 
-ACCURATE_TERRAIN: dict[str, Any] = {
-    "hfvm": {"preset": "accurate"},
-    "locus": {"both": True},
-    "track": {"points": 2000},
-    "merge": {"max_std_cells": 0.7},
-}
-"""What ``terrain.preset = "accurate"`` sets; a value given for any of these keys wins.
-
-So many points because models that are half as wrong show half as small an error of the poses that merge them.
-"""
-
-
-FAST_REFINEMENT: dict[str, Any] = {"locus": {"refine_steps": 6}}
-"""What ``hfvm.preset = "fast"`` sets in other sections: two steps leave more of its larger errors (after six, errors of
-merged elevations of three beds are .87 to .91 times those, within one standard deviation .68 instead of .56)."""
-
-NAVIGATION: dict[str, Any] = {
-    "hfvm": {"preset": "fast"},
-    "motion": {"level": 3},
-    "track": {"points": 200},
-    "orientation": {"samples": 600},
-}
-"""What ``keyframes.preset = "navigation"`` sets in other sections, where nothing is given there.
-
-Half the resolution of disparities and displacements is enough for a trajectory.
-"""
+PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    # So many points because models that are half as wrong show half as small an error of the poses that merge them.
+    (
+        "terrain",
+        "accurate",
+        {
+            "hfvm": {"preset": "accurate"},
+            "locus": {"both": True},
+            "track": {"points": 2000},
+            "merge": {"max_std_cells": 0.7},
+        },
+    ),
+    # Three steps leave more of its larger errors: after six, elevations of three beds err by .82 to .87 times as much.
+    ("hfvm", "fast", {"locus": {"refine_steps": 6}}),
+    # Half the resolution of disparities and displacements is enough for a trajectory.
+    (
+        "keyframes",
+        "navigation",
+        {
+            "hfvm": {"preset": "fast"},
+            "motion": {"level": 3},
+            "track": {"points": 200},
+            "orientation": {"samples": 600},
+        },
+    ),
+)
+"""Presets of a section, and what each sets in other sections, beneath the values that are given there."""
 
 
 class TerrainParams(Params):
@@ -180,7 +182,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def refuse_other_sections(given: Iterable[str], own: Sequence[str], command: str) -> None:
+def refuse_other_sections(given: Iterable[str], own: tuple[str, ...], command: str) -> None:
     """Refuse sections that a command does not read.
 
     Raises
@@ -211,12 +213,9 @@ def build(*layers: Mapping[str, Any]) -> Params:
     nested: dict[str, Any] = {}
     for layer in layers:
         merge(nested, layer)
-    if _preset(nested, "terrain") == "accurate":
-        nested = _beneath(nested, ACCURATE_TERRAIN)
-    if _preset(nested, "hfvm") == "fast":
-        nested = _beneath(nested, FAST_REFINEMENT)
-    if _preset(nested, "keyframes") == "navigation":
-        nested = _beneath(nested, NAVIGATION)
+    for section, preset, values in PRESETS:
+        if _preset(nested, section) == preset:
+            nested = merge(merge({}, values), nested)
     return validate(model(), nested, also=DATASET_SECTIONS)
 
 
@@ -225,9 +224,10 @@ def _preset(nested: Mapping[str, Any], section: str) -> Any:
     return values.get("preset") if isinstance(values, Mapping) else None
 
 
-def _beneath(nested: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
-    """A preset beneath the given values, which win."""
-    return merge(merge({}, preset), nested)
+def suited(sequence: Sequence) -> dict[str, Any]:
+    """Parameters that suit a sequence, by section: its vehicle's limits, and defaults that it states."""
+    vehicle = {} if sequence.vehicle is None else {"vehicle": sequence.vehicle.model_dump(mode="json")}
+    return merge(vehicle, expand(sequence.defaults))
 
 
 def validate(kind: type[Model], values: Mapping[str, Any], section: str = "", also: Iterable[str] = ()) -> Model:

@@ -46,11 +46,11 @@ class Products:
 
     Attributes
     ----------
+    images : left images, free of distortion.
     chained : the trajectory before its adjustment to loops and sensors; None: there was none.
     """
 
     images: dict[int, Handle] = field(default_factory=dict)
-    undistorted: dict[int, Handle] = field(default_factory=dict)
     screening: Handle[odometry.ScreeningFacts] | None = None
     keyframes: Handle[odometry.KeyframesFacts] | None = None
     orientations: dict[int, Handle[calibration.OrientationFacts]] = field(default_factory=dict)

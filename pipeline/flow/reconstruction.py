@@ -251,7 +251,7 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     # Pairs of other pieces have poses in frames of their own, whose place in this world is unknown.
     there = [k for k in pairs if k in world and positions[k]]
     for k in there:
-        _, p.world_dem[k] = make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
+        make.world_model(pairs[k], pairs[there[0]], row[k], p.trajectory, p.moving.get(k))
     indexed = [
         make.node(tile_index_stage, f"tile_index/{k}", dem=dem, side=TILE_CELLS) for k, dem in p.world_dem.items()
     ]
@@ -513,8 +513,8 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
     """Local elevation models of stereo pairs on the lattice of the ``first``; on ground also risk maps and paths."""
     p, pairs = make.products, dict[int, Pair]()
     for one in matched:
-        k, pair = one.frame, make.pair(one.frame, one.level, one.rig, first)
-        pairs[k], p.local_dem[k] = pair, pair.dem
+        k = one.frame
+        pair = pairs[k] = make.pair(k, one.level, one.rig, first)
         if "reference" not in one.level.spec.args:
             p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")

@@ -133,7 +133,7 @@ def _of_map(run: RunView) -> tuple[object, ...]:
 
 def _of_stops(run: RunView) -> tuple[object, ...]:
     p = run.products
-    return p.disparity, p.images, p.undistorted, p.local_dem, p.local_risk, p.local_path, run.sequence.rig
+    return p.disparity, p.images, p.local_dem, p.local_risk, p.local_path, run.sequence.rig
 
 
 def _of_trajectory(run: RunView) -> tuple[object, ...]:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export.artifacts import by_frame, used_rig
 from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.rasters import whole
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RunView, by_frame, used_rig
 from rille.pipeline.flow.products import Stop
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Bundle

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from rille.pipeline.export import artifacts
 from rille.pipeline.export.view import artifact
 from rille.pipeline.flow.products import Stop
 from rille.pipeline.report import canvas, gather, ranges
@@ -97,7 +96,7 @@ def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[P
 
 def _pair(scene: Scene, pair: int, width: int) -> Panel:
     view = scene.view
-    bundle, image = artifact(view, view.products.disparity[pair]), artifacts.image(view, pair)
+    bundle, image = artifact(view, view.products.disparity[pair]), view.bundle(view.products.images.get(pair))
     band, sign = depth_band(view.sequence.rig)
     there = matched(np.asarray(bundle["validity"]))
     seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))

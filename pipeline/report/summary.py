@@ -406,7 +406,7 @@ def _stages(view: RunView) -> dict[str, dict[str, Any]]:
     return {name: {key: round(value, 3) for key, value in row.items()} for name, row in by_stage.items()}
 
 
-NOT_IN_FACTS = ("images", "undistorted", "world_dem")
+NOT_IN_FACTS = ("images", "world_dem")
 """Products that the facts are not made of."""
 
 

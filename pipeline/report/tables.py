@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.export.artifacts import chain
+from rille.pipeline.export.view import chain
 from rille.pipeline.flow.products import Products
 from rille.pipeline.report import gather
 from rille.pipeline.report.gather import facts_of

@@ -38,141 +38,129 @@ MAX_SPEED = 60.0
 
 
 @dataclass(frozen=True)
-class InputLimit:
-    """Code and remedy of a finding if a figure is below ``least`` or above ``most``."""
+class Limit:
+    """Code and remedy of a finding if a figure of a subject is below ``least`` or above ``most``."""
 
     code: str
     figure: str
+    subject: str
     remedy: str = ""
     least: float = -math.inf
     most: float = math.inf
     level: ClassVar[Level] = "WARN"
 
 
-class Fault(InputLimit):
+class Fault(Limit):
     """A limit beyond which a reconstruction is useless or impossible."""
 
     level = "FAIL"
 
 
-LIMITS = {
-    "rig": (
-        Fault("RIL-640", "baselines to the left", most=0.5, remedy="swap left and right"),  # of the right camera
-        # Outside of these limits another unit of length is likelier than such a rig.
-        InputLimit("RIL-641", "baseline, m", least=0.01, most=5.0, remedy="is the baseline in metres?"),
-        InputLimit("RIL-642", "ratio of the focal lengths", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
+LIMITS = (
+    Fault("RIL-640", "baselines to the left", "rig", most=0.5, remedy="swap left and right"),  # of the right camera
+    # Outside of these limits another unit of length is likelier than such a rig.
+    Limit("RIL-641", "baseline, m", "rig", least=0.01, most=5.0, remedy="is the baseline in metres?"),
+    Limit("RIL-642", "ratio of the focal lengths", "rig", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
+    Fault("RIL-643", "steps back", "times", most=0, remedy="correct the times"),
+    Limit("RIL-644", "gaps", "times", most=0, remedy="are frames missing there, or was the clock set forward?"),
+    Limit("RIL-645", "without", "truth", most=0, remedy="frames without truth are left out of the accuracy"),
+    Fault("RIL-646", "degrees off", "attitude", most=2.0, remedy="check T_body_left, the axes and degrees or radians"),
+    Limit("RIL-647", "without", "attitude", most=0, remedy="the other frames are matched without it"),
+    Fault("RIL-977", "m/s", "odometry", most=MAX_SPEED, remedy="check its unit, and the unit of the times"),
+    Limit(
+        "RIL-978", "length over the truth's", "odometry", least=0.8, most=1.25, remedy="check its unit and T_body_left"
     ),
-    "times": (
-        Fault("RIL-643", "steps back", most=0, remedy="correct the times"),
-        InputLimit("RIL-644", "gaps", most=0, remedy="are frames missing there, or was the clock set forward?"),
+    Limit("RIL-988", "without", "odometry", most=0, remedy="the other frames are predicted without it"),
+    Fault("RIL-989", "m/s", "positions", most=MAX_SPEED, remedy="check their unit, and the unit of the times"),
+    # Fewer do not determine a rotation.
+    Limit("RIL-990", "rows", "positions", least=3, remedy="is time_offset right, and the clock the images'?"),
+    Limit("RIL-991", "lengths over sigma", "positions", least=1.0, remedy="they say nothing of so short a way"),
+    Limit("RIL-648", "known", "up", least=1, remedy="the ground is levelled by its own plane"),
+    # y points down in camera frames: up has a negative y in an upright camera.
+    Limit("RIL-649", "y in the images", "up", most=0.0, remedy="held upside down, or a wrong sign?"),
+    Limit("RIL-650", "blank", "images", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
+    Limit("RIL-668", "lost", "images", most=0, remedy="it gets no pose; its neighbours are joined across it"),
+    Fault("RIL-670", "unusable", "images", most=0, remedy="mend, convert or remove what is wrong"),
+    Fault("RIL-671", "left and right are one", "images", most=0, remedy="give the right camera's images"),
+    Limit("RIL-677", "grey", "images", most=0),
+    Limit("RIL-672", "repeated", "images", most=0, remedy="was a frame copied, or did the camera hang?"),
+    # A white sky is less than this; more means clipped ground.
+    Limit("RIL-651", "clipped", "exposure", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
+    # The matcher removes the mean, but not the noise.
+    Limit(
+        "RIL-652", "change", "exposure", most=1.5, remedy="it is levelled, but black and white is lost: fix exposure"
     ),
-    "truth": (InputLimit("RIL-645", "without", most=0, remedy="frames without truth are left out of the accuracy"),),
-    "attitude": (
-        Fault("RIL-646", "degrees off", most=2.0, remedy="check T_body_left, the axes and degrees or radians"),
-        InputLimit("RIL-647", "without", most=0, remedy="the other frames are matched without it"),
+    Limit("RIL-755", "faint", "exposure", most=0),
+    Limit("RIL-653", "right over left", "exposure", least=1 / 1.5, most=1.5, remedy="give both one exposure and depth"),
+    Limit("RIL-654", "blurred", "sharpness", most=0, remedy="leave them out, or expect a weak pose there"),
+    Limit("RIL-655", "right over left", "sharpness", least=0.7, most=1 / 0.7, remedy="out of focus, or a dirty lens?"),
+    Fault("RIL-669", "whole pairs", "matching", least=1),
+    Fault(
+        "RIL-907",
+        "borne out",
+        "matching",
+        least=0.1,
+        remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
+        "rows in order (PFM has the lowest first)?",
     ),
-    "odometry": (
-        Fault("RIL-977", "m/s", most=MAX_SPEED, remedy="check its unit, and the unit of the times"),
-        InputLimit("RIL-978", "length over the truth's", least=0.8, most=1.25, remedy="check its unit and T_body_left"),
-        InputLimit("RIL-988", "without", most=0, remedy="the other frames are predicted without it"),
+    Fault(
+        "RIL-656",
+        "matched",
+        "matching",
+        least=0.02,
+        remedy="do both images show one scene, taken at one time, sharp, and neither mirrored?",
     ),
-    "positions": (
-        Fault("RIL-989", "m/s", most=MAX_SPEED, remedy="check their unit, and the unit of the times"),
-        # Fewer do not determine a rotation.
-        InputLimit("RIL-990", "rows", least=3, remedy="is time_offset right, and the clock the images'?"),
-        InputLimit("RIL-991", "lengths over sigma", least=1.0, remedy="they say nothing of so short a way"),
+    Limit("RIL-657", "matched", "matching", least=0.3, remedy="little texture, or little overlap of left and right"),
+    Limit("RIL-658", "baselines away", "matching", most=200, remedy="depth is a guess there; is the baseline right?"),
+    Fault(
+        "RIL-659",
+        "beyond",
+        "sides",
+        most=0.5,
+        remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
+        "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
+        "angle between the cameras is off",
     ),
-    "up": (
-        InputLimit("RIL-648", "known", least=1, remedy="the ground is levelled by its own plane"),
-        # y points down in camera frames: up has a negative y in an upright camera.
-        InputLimit("RIL-649", "y in the images", most=0.0, remedy="held upside down, or a wrong sign?"),
+    Limit("RIL-660", "beyond", "sides", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
+    Limit("RIL-773", "unlike", "sides", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
+    Limit("RIL-681", "misread", "distortion", most=0),
+    Limit("RIL-679", "above", "ground", most=0),
+    Limit("RIL-661", "known", "epipolar", least=1, remedy="see the matching"),
+    Fault("RIL-673", "turned, degrees", "epipolar", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
+    Fault("RIL-662", "adjusted, px", "epipolar", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
+    Limit(
+        "RIL-663", "adjusted, px", "epipolar", most=1.0, remedy="is lens distortion left in, or the wrong file given?"
     ),
-    "images": (
-        InputLimit("RIL-650", "blank", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
-        InputLimit("RIL-668", "lost", most=0, remedy="it gets no pose; its neighbours are joined across it"),
-        Fault("RIL-670", "unusable", most=0, remedy="mend, convert or remove what is wrong"),
-        Fault("RIL-671", "left and right are one", most=0, remedy="give the right camera's images"),
-        InputLimit("RIL-677", "grey", most=0),
-        InputLimit("RIL-672", "repeated", most=0, remedy="was a frame copied, or did the camera hang?"),
+    Limit(
+        "RIL-664",
+        "residual or row offset",  # px, half px
+        "epipolar",
+        most=1.0,
+        remedy="are the images rectified already (images.rectified)? Else the calibration is off: reconstruct "
+        "repairs what the images tell, `rille calibrate` the rest",
     ),
-    "exposure": (
-        # A white sky is less than this; more means clipped ground.
-        InputLimit("RIL-651", "clipped", most=0.2, remedy="such areas cannot be matched; mask them or expose anew"),
-        # The matcher removes the mean, but not the noise.
-        InputLimit("RIL-652", "change", most=1.5, remedy="it is levelled, but black and white is lost: fix exposure"),
-        InputLimit("RIL-755", "faint", most=0),
-        InputLimit("RIL-653", "right over left", least=1 / 1.5, most=1.5, remedy="give both one exposure and depth"),
+    Limit(
+        "RIL-712",
+        "repeated",
+        "repetition",
+        most=MAX_REPEATED_SHARE,
+        remedy="matches may be off by a period: view along the rows, or from nearer",
     ),
-    "sharpness": (
-        InputLimit("RIL-654", "blurred", most=0, remedy="leave them out, or expect a weak pose there"),
-        InputLimit("RIL-655", "right over left", least=0.7, most=1 / 0.7, remedy="out of focus, or a dirty lens?"),
+    Fault("RIL-665", "contradictions", "simultaneous", most=0, remedy="pair the images anew"),
+    # tracking needs most of a left image to be in the next one
+    Fault(
+        "RIL-666", "overlap", "motion", least=0.1, remedy="the trajectory breaks there; add frames between, or split it"
     ),
-    "matching": (
-        Fault("RIL-669", "whole pairs", least=1),
-        Fault(
-            "RIL-907",
-            "borne out",
-            least=0.1,
-            remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
-            "rows in order (PFM has the lowest first)?",
-        ),
-        Fault(
-            "RIL-656",
-            "matched",
-            least=0.02,
-            remedy="do both images show one scene, taken at one time, sharp, and neither mirrored?",
-        ),
-        InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
-        InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
+    Limit("RIL-667", "overlap", "motion", least=0.4, remedy="take every frame, or expect weak poses there"),
+    Limit(
+        "RIL-715",
+        "largest motion, px",
+        "motion",
+        least=0.5,
+        remedy="if the camera moved, take frames farther apart; what moves along with it hides its motion: switch "
+        "off a projector of dots, mask its own body",
     ),
-    "sides": (
-        Fault(
-            "RIL-659",
-            "beyond",
-            most=0.5,
-            remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
-            "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
-            "angle between the cameras is off",
-        ),
-        InputLimit("RIL-660", "beyond", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
-        InputLimit("RIL-773", "unlike", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
-    ),
-    "distortion": (InputLimit("RIL-681", "misread", most=0),),
-    "ground": (InputLimit("RIL-679", "above", most=0),),
-    "epipolar": (
-        InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
-        Fault("RIL-673", "turned, degrees", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
-        Fault("RIL-662", "adjusted, px", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
-        InputLimit("RIL-663", "adjusted, px", most=1.0, remedy="is lens distortion left in, or the wrong file given?"),
-        InputLimit(
-            "RIL-664",
-            "residual or row offset",  # px, half px
-            most=1.0,
-            remedy="are the images rectified already (images.rectified)? Else the calibration is off: reconstruct "
-            "repairs what the images tell, `rille calibrate` the rest",
-        ),
-    ),
-    "repetition": (
-        InputLimit(
-            "RIL-712",
-            "repeated",
-            most=MAX_REPEATED_SHARE,
-            remedy="matches may be off by a period: view along the rows, or from nearer",
-        ),
-    ),
-    "simultaneous": (Fault("RIL-665", "contradictions", most=0, remedy="pair the images anew"),),
-    "motion": (  # tracking needs most of a left image to be in the next one
-        Fault("RIL-666", "overlap", least=0.1, remedy="the trajectory breaks there; add frames between, or split it"),
-        InputLimit("RIL-667", "overlap", least=0.4, remedy="take every frame, or expect weak poses there"),
-        InputLimit(
-            "RIL-715",
-            "largest motion, px",
-            least=0.5,
-            remedy="if the camera moved, take frames farther apart; what moves along with it hides its motion: switch "
-            "off a projector of dots, mask its own body",
-        ),
-    ),
-}
+)
 """Limits of the figures of each subject, the most severe first."""
 
 
@@ -193,8 +181,8 @@ class Finding:
 
 def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -> Finding:
     """Finding of the first limit that a figure of the subject, by name, exceeds; else an OK one."""
-    for limit in LIMITS.get(subject, ()):
-        figure = (figures or {}).get(limit.figure)
+    for limit in LIMITS:
+        figure = (figures or {}).get(limit.figure) if limit.subject == subject else None
         if figure is not None and not limit.least <= figure <= limit.most:
             return Finding(limit.code, text, subject, limit.level, limit.remedy)
     return Finding("", text, subject)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rille.pipeline.engine import events
 from rille.pipeline.engine.plain import some
@@ -68,12 +69,10 @@ def find(text: str, runs: Path) -> Path:
     for path in (Path(text), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()
-    for run in known:
-        if text in (run.name, name(run)):
+    # By its name alone, or the last one of a sequence none of whose runs has ended.
+    for run in reversed(known):
+        if text in (run.name, run.parent.name):
             return run.resolve()
-    started = [run for run in known if run.parent.name == text]
-    if started:  # none of them has ended
-        return started[-1].resolve()
     names = [word for run in known for word in (name(run), run.parent.name, run.name)]
     where = f"there are {some(sorted({run.parent.name for run in known}), 4)}" if known else f"{runs} holds none"
     raise ConfigError("RIL-067", f"no run {text!r}", remedy=did_you_mean(text, names) or where)
@@ -109,6 +108,11 @@ def earlier(run: Path, *, of_any: bool = False) -> Iterator[Path]:
     yield from sorted(before, key=lambda r: r.name, reverse=True)
 
 
+def tasks(run: Path) -> dict[str, dict[str, Any]]:
+    """Rows of a run's ledger by the label of their task."""
+    return {row["label"]: row for row in events.read(run / LEDGER)}
+
+
 def used(run: Path) -> set[str]:
     """Keys of all artifacts that a run used.
 
@@ -118,5 +122,5 @@ def used(run: Path) -> set[str]:
         Its ledger cannot be read.
     """
     with reading(run):
-        rows = (row for row in events.read(run / LEDGER) if row["status"] in ("computed", "cached"))
+        rows = (row for row in tasks(run).values() if row["status"] in ("computed", "cached"))
         return {str(row["key"]) for row in rows if "key" in row}

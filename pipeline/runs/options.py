@@ -108,10 +108,6 @@ class Options(Work):
     progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
     quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
 
-    def __post_init__(self) -> None:
-        if self.quiet:
-            object.__setattr__(self, "progress", "quiet")
-
     def part(self) -> str:
         """The options that choose a part of the run, as typed; empty: all of it."""
         return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])

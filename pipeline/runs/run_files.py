@@ -1,9 +1,13 @@
-"""Files of a run: copies of its outputs, which are tasks of its graph, and the report."""
+"""Files of a run: the tasks of its outputs, copies of what these have made, and the report.
+
+The code that lays out the tasks is no part of their keys: modules that declare outputs do not import it.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,12 +20,13 @@ from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
-from rille.pipeline.export.output import Output, unpack
-from rille.pipeline.export.output_task import add, handles
-from rille.pipeline.export.view import RunView, TaskRow
+from rille.pipeline.export.output import FORMS, Output, unpack
+from rille.pipeline.export.view import Part, RunView, TaskRow, part
+from rille.pipeline.export.writers import write_json
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.report.page import write_report
+from rille.stages.core.declare import NoParams
 
 MODULES = (*catalogue.MADE, gallery, summary)
 Made = dict[str, Handle]
@@ -69,6 +74,49 @@ def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made:
         made[output.name] = node
 
 
+def handles(output: Output, run: RunView) -> list[Handle]:
+    """Distinct handles of the artifacts that an output takes."""
+    return _handles(part(run, output.names))
+
+
+def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
+    """Add the task that makes an output of ``module``; None if a product that it needs is missing."""
+    if not all(needed and all(map(_due, _handles(needed))) for needed in output.needs(run)):
+        return None
+    there: dict[Handle, int] = {}
+    args = {"file": output.name, "run": _form(part(run, output.names), there, _due)}
+    return graph.node(module.__name__, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
+
+
+def _due(handle: Handle) -> bool:
+    """Whether there is an artifact, or a plan is to compute it."""
+    return handle.ref is not None or handle.status == "planned"
+
+
+def _handles(value: Any) -> list[Handle]:
+    there: dict[Handle, int] = {}
+    _form(value, there, lambda _: True)
+    return list(there)
+
+
+def _form(value: Any, there: dict[Handle, int], wanted: Callable[[Handle], bool]) -> Any:
+    """Plain form of an input; wanted handles are collected in ``there`` and replaced by their number, others by None.
+
+    Dictionaries are sorted, because the order of tasks follows that of results, which varies.
+    """
+    if isinstance(value, Handle):
+        return {"artifact": there.setdefault(value, len(there))} if wanted(value) else None
+    if (form := FORMS.get(type(value).__name__)) is not None:
+        return {type(value).__name__: form.write(value)}
+    if isinstance(value, Mapping):
+        return {"by": [[key, _form(value[key], there, wanted)] for key in sorted(value)]}
+    if isinstance(value, list | tuple):
+        return [_form(item, there, wanted) for item in value]
+    if isinstance(value, Part) or is_dataclass(value):
+        return {"part": {name: _form(item, there, wanted) for name, item in vars(value).items()}}
+    return value
+
+
 def task_rows(graph: Graph, failures: Iterable[Failure]) -> tuple[TaskRow, ...]:
     """One row for each task, with the seconds of its computation in any run, and one for each flow that failed."""
     rows = []
@@ -91,7 +139,7 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, An
     meta = None if trajectory is None or trajectory.ref is None else trajectory.ref.meta
     vertical = "" if meta is None else meta["verticals"][meta["main"]]
     frames = catalogue.describe([p.name for p in folder.iterdir()], view, vertical)
-    atomic.write(folder / "frames.json", json.dumps(frames, indent=1) + "\n")
+    write_json(folder / "frames.json", frames)
     (facts,) = _files(made["facts"], store).values()
     figures = [
         FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made.get(o.name), store).values()

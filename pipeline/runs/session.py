@@ -77,16 +77,14 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
     elif for_dataset:
         text = f"{next(iter(for_dataset))}: the sequence is open already"
         raise ConfigError("RIL-860", text, remedy="give its parameters to rille.open")
-    vehicle, source = {}, UNSTATED
-    if sequence.vehicle is not None:
-        vehicle, source = {"vehicle": sequence.vehicle.model_dump()}, f"sequence {sequence.name}"
+    source = UNSTATED if sequence.vehicle is None else f"sequence {sequence.name}"
     if "vehicle" in for_stages:
         source = "user"
     # Defaults of the sequence lie beneath the user's values.
-    layers = vehicle, configuration.expand(sequence.defaults)
     with within(f"defaults of {sequence.name}"):
-        suited = configuration.build(*layers)
-    config = configuration.build(*layers, for_stages)
+        defaults = configuration.suited(sequence)
+        suited = configuration.build(defaults)
+    config = configuration.build(defaults, for_stages)
     given = unread.set_by_user(for_stages, config, suited)
     frames = choose_frames(options.frames, sequence.frames)
     return Settled(sequence=sequence, frames=frames, config=config, vehicle_source=source, given=given)
@@ -261,7 +259,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / LEDGER,
-            progress=progress.make(options.progress),
+            progress=progress.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             kept=kept,
         ),

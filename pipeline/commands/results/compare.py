@@ -13,7 +13,6 @@ import numpy as np
 from rille.datasets.manifest.opening import dotted
 from rille.datasets.text.reading import read_toml
 from rille.pipeline import api
-from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.quantities import metres, quantity
@@ -43,7 +42,7 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 def _tasks(a: Path, b: Path) -> Iterator[str]:
     """Counts by stage: tasks with another result, and tasks with a result in one run alone, or in neither."""
-    ledgers = [{row["label"]: row for row in events.read(run / lookup.LEDGER)} for run in (a, b)]
+    ledgers = [lookup.tasks(run) for run in (a, b)]
     # A failed or skipped task has no digest.
     digests = {label: tuple(rows.get(label, {}).get("digest") for rows in ledgers) for label in ledgers[0] | ledgers[1]}
     fates = {label: _fate(*pair) for label, pair in digests.items()}

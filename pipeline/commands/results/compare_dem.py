@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -15,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.read_dem import DemFile, crs_name
-from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands
+from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, write_bands, write_json
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
@@ -84,7 +82,7 @@ def compare_dem(
         rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
         lines += _change_table(figures["changes"])
     print("\n".join(lines))
-    atomic.write(facts, json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    write_json(facts, figures)
     crs = (other if np.array_equal(cells.matrix, other.grid.matrix) else one).crs
     profile = {"driver": "COG", "crs": crs or None, "transform": read_dem.transform_of(cells)}
     write_bands(raster, rasters, Meaning("m", tags={"error": figures["error"]}), profile)

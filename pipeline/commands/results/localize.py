@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,12 +17,11 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline import api
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
-from rille.pipeline.export.writers import ENGINEERING_CRS, write_trajectory_tum
+from rille.pipeline.export.writers import ENGINEERING_CRS, write_json, write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
 from rille.stages.core.declare import Bundle
@@ -173,7 +171,7 @@ def localize(
         output_file(output, ending).unlink(missing_ok=True)
     facts: dict[str, Any] = {"run": terrain.name, "dem": dem and str(dem), "ortho": ortho and str(ortho), "crs": crs}
     facts |= {"ambiguous": bool(why), "why": why, **({} if found is None else for_file(found))}
-    atomic.write(written[0], json.dumps(facts, indent=1, allow_nan=False) + "\n")
+    write_json(written[0], facts)
     if found is None or why:
         lines = [f"ambiguous    {why}"]
     else:

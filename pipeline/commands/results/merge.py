@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,9 +15,8 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.text.warning import warning
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.read_dem import refuse_unlike_systems
-from rille.pipeline.export.writers import Meaning, check_folder, write_raster
+from rille.pipeline.export.writers import Meaning, check_folder, write_json, write_raster
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
@@ -56,7 +54,7 @@ class Session:
     @property
     def level(self) -> float:
         """Middle elevation of its terrain in its own frame, m."""
-        return float(np.nanmedian(self.terrain.elevation))
+        return float(np.nanmedian(self.terrain.arrays["elevation"]))
 
 
 def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RUNS) -> None:
@@ -79,14 +77,13 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     first, *others = (Terrain.of(folder) for folder in dict.fromkeys(folders))
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])
-    own = {"elevation": first.elevation, "elevation_std": first.sigma, "ortho": first.ortho}
-    layers = [_layer(0, first.lattice, own)]
+    layers = [_layer(0, first.lattice, first.arrays)]
     layers += [_laid(number, first, one) for number, one in enumerate(sessions, start=1)]
     merged = merge_layers(layers, lattice, MergeParams.model_validate({}))
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
     # First, since it marks the folder as ours, so that the same command can continue after a kill.
     facts = {"frame_of": first.name, "runs": [dict(one.facts) for one in sessions]}
-    atomic.write(output / "merge.json", json.dumps(facts, indent=1) + "\n")
+    write_json(output / "merge.json", facts)
     for name, band, values, unit in (
         ("dem.tif", "elevation", height, "m"),
         ("dem_sigma.tif", "elevation_std", merged.elevation_std, "m"),
@@ -197,13 +194,13 @@ def _laid(number: int, first: Terrain, session: Session) -> ModelLayer:
     arm, sigma = xy - session.centre[:2], session.sigma
     sideways = (slopes[0] * np.hypot(sigma[0], sigma[5] * arm[..., 1])) ** 2
     sideways += (slopes[1] * np.hypot(sigma[1], sigma[5] * arm[..., 0])) ** 2
-    std = np.sqrt(grid.at(own, terrain.sigma) ** 2 + sideways)
-    ortho = grid.at(own, terrain.ortho)
+    std = np.sqrt(grid.at(own, terrain.arrays["elevation_std"]) ** 2 + sideways)
+    ortho = grid.at(own, terrain.arrays["ortho"])
     common = lattice.intersection(first.lattice)
     gain = 1.0
     if common is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.log(first.ortho[first.lattice.window(common)] / ortho[lattice.window(common)])
+            ratio = np.log(first.arrays["ortho"][first.lattice.window(common)] / ortho[lattice.window(common)])
         gain = math.exp(float(np.median(ratio[np.isfinite(ratio)]))) if np.isfinite(ratio).any() else 1.0
     placed = Placed(session.centre, np.diag([sigma[2], sigma[3], sigma[4]]) ** 2)
     return _layer(number, lattice, {"elevation": height, "elevation_std": std, "ortho": ortho}, gain, placed)

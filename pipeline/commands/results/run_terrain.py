@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,15 +21,14 @@ from rille.stages.terrain.relief.grid import Grid
 
 @dataclass(frozen=True)
 class Terrain:
-    """Merged terrain of a run: elevations, their standard deviations, m, and grey values (row, col) on ``lattice``.
+    """Merged terrain of a run.
 
-    ``place`` of the world frame, if the run has one; ``vertical``: source of the world's vertical.
+    ``arrays`` (row, col) on ``lattice``: ``elevation``, its standard deviation ``elevation_std``, m, and grey values
+    ``ortho``. ``place`` of the world frame, if the run has one; ``vertical``: source of the world's vertical.
     """
 
     name: str
-    elevation: Floats
-    sigma: Floats
-    ortho: Floats
+    arrays: Mapping[str, Floats]
     lattice: Lattice
     place: Georeference | None
     vertical: str
@@ -50,22 +50,21 @@ class Terrain:
             about = terrain.attrs
             rows, cols = terrain["elevation"].shape
             lattice = Lattice(float(terrain.x[0]), float(terrain.y[0]), float(about["cell_size_m"]), rows, cols)
-            names = "elevation", "elevation_std", "ortho"
-            elevation, sigma, ortho = (np.asarray(terrain[key], np.float64) for key in names)
+            arrays = {key: np.asarray(terrain[key], np.float64) for key in ("elevation", "elevation_std", "ortho")}
             place = georeference_in(frames)
         if vertical == REFERENCE_PLANE:
             raise no_ground(f"run {name}")
-        if not np.isfinite(elevation).any():
+        if not np.isfinite(arrays["elevation"]).any():
             text = f"the terrain of run {name} has no known cell"
             raise InputError("RIL-843", text, remedy="its report says what is missing")
-        return Terrain(name, elevation, sigma, ortho, lattice, place, vertical)
+        return Terrain(name, arrays, lattice, place, vertical)
 
     @property
     def grid(self) -> Grid:
         """The elevations in the world frame."""
-        return Grid.on(self.lattice, self.elevation)
+        return Grid.on(self.lattice, self.arrays["elevation"])
 
     @property
     def image(self) -> Grid:
         """The ortho image in the world frame."""
-        return Grid.on(self.lattice, self.ortho)
+        return Grid.on(self.lattice, self.arrays["ortho"])

@@ -40,8 +40,7 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
         with lookup.reading(run):
             facts = events.facts(run / lookup.LEDGER)
             outdated = set(facts.get("outdated", ()))
-            rows = (row for row in events.read(run / lookup.LEDGER) if row["label"] not in outdated)
-            statuses = Counter(row["status"] for row in rows)
+            statuses = Counter(row["status"] for label, row in lookup.tasks(run).items() if label not in outdated)
             missing = statuses["failed"] + statuses["skipped"]
             # "ok": all tasks have ended; "total": files and report are written too.
             whole = "unfinished" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
@@ -75,9 +74,8 @@ def timing(run: Run = "latest", *, runs: Runs = RUNS) -> None:
 
 def by_stage(run: Path) -> Iterator[str]:
     """Lines of the table of a run's time, the stage with the most seconds first."""
-    rows, facts = events.read(run / lookup.LEDGER), events.facts(run / lookup.LEDGER)
-    stages = defaultdict[str, Counter[str]](Counter)
-    for row in rows:
+    facts, stages = events.facts(run / lookup.LEDGER), defaultdict[str, Counter[str]](Counter)
+    for row in lookup.tasks(run).values():
         sums = Counter({"seconds": row.get("kernel", 0.0), "compiling": row.get("compiling", 0.0), row["status"]: 1})
         stages[row["stage"]] += sums
     wall = facts.get("total", facts.get("seconds"))

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine import events, provenance
+from rille.pipeline.engine import provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief, some
@@ -45,7 +45,7 @@ def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFol
 
 def summary(run: Path) -> Iterable[str]:
     """Lines on all tasks of a run: their number by stage, outcome and reason."""
-    rows = events.read(run / lookup.LEDGER)
+    rows = lookup.tasks(run).values()
     yield f"{len(rows)} tasks in run {lookup.name(run)}"
     groups: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
@@ -64,7 +64,7 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     ConfigError
         The run has no such task.
     """
-    rows = {row["label"]: row for row in events.read(run / lookup.LEDGER)}
+    rows = lookup.tasks(run)
     if label not in rows:
         text = f"run {lookup.name(run)} has no task {label!r}"
         raise ConfigError("RIL-068", text, remedy=did_you_mean(label, rows) or f"it has {some(list(rows), 4)}")
@@ -102,7 +102,7 @@ def _fate(row: Mapping[str, Any], run: Path, made: Mapping[str, Any] | None, sto
 def _computed_by(row: Mapping[str, Any], run: Path) -> str:
     """The kept run that computed it, in words."""
     for before in lookup.earlier(run, of_any=True):
-        for other in events.read(before / lookup.LEDGER):
+        for other in lookup.tasks(before).values():
             if other.get("key") == row.get("key") and other["status"] == "computed":
                 return f"; run {lookup.name(before)} computed it"
     return "; the run that computed it is not kept"
@@ -151,9 +151,8 @@ def _section(stage: str, params: Mapping[str, Any]) -> tuple[str, Mapping[str, A
 
 def _since(run: Path, row: Mapping[str, Any], made: Mapping[str, Any], store: Store) -> Iterable[str]:
     """Differences from the last earlier run that had this task."""
-    past = ((before, other) for before in lookup.earlier(run) for other in events.read(before / lookup.LEDGER))
-    had = ((before, other) for before, other in past if other["label"] == row["label"] and "key" in other)
-    before, other = next(had, (run, None))
+    past = ((before, lookup.tasks(before).get(row["label"])) for before in lookup.earlier(run))
+    before, other = next(((before, other) for before, other in past if other and "key" in other), (run, None))
     if other is None:
         yield "since         no earlier run of this sequence had this task"
         return

@@ -12,11 +12,11 @@ import numpy as np
 
 from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.pipeline.engine.plain import raw, warn
-from rille.pipeline.export.writers import write_confidence, write_disparity
+from rille.pipeline.export.writers import Meaning, write_image
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
-from rille.stages.core.validity import matched
+from rille.stages.core.validity import Validity, matched
 
 
 def match(
@@ -74,11 +74,15 @@ def match(
         options = tiles.match_options(tiles.Tiling(), params, PyramidParams(), shapes, tell)
         result = hfvm.match(images[0], images[1], params, options=options)
     kept = np.isfinite(result.column_disparity) if dense else matched(result.validity)
-    column, row = (np.where(kept, array, np.nan) for array in (result.column_disparity, result.row_disparity))
     tags = {"LEFT": left.name, "RIGHT": right.name}
-    write_disparity(output, column, row, tags | {"FILLED": str(dense).lower()})
+    about = {"convention": "right minus left, pixels of the left image, NaN undefined", "FILLED": str(dense).lower()}
+    disparities = {n: np.where(kept, getattr(result, n), np.nan) for n in ("column_disparity", "row_disparity")}
+    write_image(output, disparities, Meaning("pixel", tags=about | tags))
     if confidence is not None:
-        write_confidence(confidence, result.disparity_std, result.validity, result.backmatch_error, tags)
+        bits = ", ".join(f"{bit.value} {str(bit.name).lower()}" for bit in Validity)
+        units = {"disparity_std": "pixel", "validity": "", "backmatch_error": "pixel"}
+        bands = {name: getattr(result, name) for name in units}
+        write_image(confidence, bands, Meaning(units, tags={"validity": f"sum of {bits}", **tags}))
     for line in (*spread, *doubts(result, *images)):
         warn(line)
     share = float(matched(result.validity).mean())
@@ -91,13 +95,11 @@ def match(
 @contextmanager
 def _progress(pixels: int) -> Iterator[Callable[[float, str], None]]:
     """Callback that shows share and step of a large match as a bar, if stderr is a terminal."""
-    # A megapixel or more: smaller images match in less than seconds.
-    if pixels < 1_000_000 or not sys.stderr.isatty():
-        yield lambda share, step: None
-        return
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(file=raw(sys.stderr)), transient=True) as bar:
+    # Images below a megapixel match in less than seconds.
+    disable = pixels < 1_000_000 or not sys.stderr.isatty()
+    with Progress(console=Console(file=raw(sys.stderr)), transient=True, disable=disable) as bar:
         task = bar.add_task("matching", total=1.0)
         yield lambda share, step: bar.update(task, completed=share, description=step)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.protocol import CAMERAS
+from rille.pipeline.export.programs.placed_pairs import placed_frames
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import frames_of
 from rille.stages.core.arrays import Bytes, Floats
@@ -24,7 +25,6 @@ from rille.stages.evaluation.crosscheck import colmap_rig
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.imaging.features import PIXEL_CENTRE
 from rille.stages.odometry.resection.landmarks import matches_at
-from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import colours
 
 MAX_REPROJECTION_PX = 0.5
@@ -78,7 +78,7 @@ def build(
     trajectory: Bundle,
     names: Mapping[int, str],
     segments: Sequence[MatchedSegment],
-    images: Mapping[int, Bundle] | None = None,
+    images: Mapping[int, Bundle],
 ) -> Any:
     """A ``pycolmap.Reconstruction``.
 
@@ -93,14 +93,10 @@ def build(
     """
     from rille.stages.geometry.colmap import pycolmap
 
-    poses = {
-        int(f): RigidTransform.from_matrix(pose)
-        for f, pose in zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
-        if np.isfinite(pose).all()
-    }
+    poses = placed_frames(trajectory)
     # Before images are made, since each point adds observations to them.
     seen: Seen = {(frame, side): [] for frame in poses for side in CAMERAS}
-    points = [point for segment in segments for point in _points(segment, rig, poses, seen, images or {})]
+    points = [point for segment in segments for point in _points(segment, rig, poses, seen, images)]
     number = {image: k for k, image in enumerate(seen, start=1)}
 
     model = pycolmap.Reconstruction()
@@ -143,7 +139,7 @@ def _ends(track: Bundle) -> list[int]:
 def _points(
     segment: MatchedSegment, rig: Rig, poses: Mapping[int, RigidTransform], seen: Seen, images: Mapping[int, Bundle]
 ) -> Iterator[tuple[Floats, list[tuple[tuple[int, str], int]], Bytes]]:
-    """Points of a segment in the world, each with its observations (image, index of its pixel) and colour (or black).
+    """Points of a segment in the world, each with its observations (image, index of its pixel) and colour.
 
     The pixels are added to ``seen``.
     """
@@ -168,7 +164,7 @@ def _points(
             shown[:, j, 1] = agrees & matched & _near(rig.right, rig.T_right_left.apply(in_left), pixels[:, j, 1])
     last = rig.left.width - 1, rig.left.height - 1
     first = np.clip(np.nan_to_num(pixels[:, 0, 0]).astype(int), 0, last)
-    rgb = colours(first, images[key]) if key in images else np.zeros((len(first), 3), np.uint8)
+    rgb = colours(first, images[key])
     # Points with one observation are not determined.
     for k in np.flatnonzero(np.isfinite(world).all(1) & (shown.sum(axis=(1, 2)) > 1)):
         elements = []

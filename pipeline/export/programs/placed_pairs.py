@@ -12,6 +12,7 @@ from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import PairPoints, points
 
 
@@ -39,12 +40,10 @@ class PlacedPairs:
     def __init__(self, run: RunArtifacts, every: int = 1) -> None:
         """``every``: step of rows and columns of the images."""
         trajectory = run.one("trajectory", last=True)
-        frames, pieces = trajectory.meta["frames"], np.asarray(trajectory["piece"]).tolist()
-        self._poses = dict(zip(frames, np.asarray(trajectory["poses"]), strict=True))
+        self._run, self._every, self._poses = run, every, placed_frames(trajectory)
         self.vertical = trajectory.meta["verticals"][trajectory.meta["main"]]
-        here = {frame for frame, piece in zip(frames, pieces, strict=True) if piece == trajectory.meta["main"]}
         pairs = sorted(int(name) for name in run.labels(r"hfvm/(\d{1,9})"))
-        self._run, self._every, self.pairs = run, every, [pair for pair in pairs if pair in here]
+        self.pairs = [pair for pair in pairs if pair in self._poses]
         unplaced = len(pairs) - len(self.pairs)
         left_out = f", {unplaced} without a pose are left out" if unplaced else ""
         self.words = f"{count(len(self.pairs), 'pair')}{left_out}"
@@ -57,4 +56,10 @@ class PlacedPairs:
             rig = Rig.from_dict(self._run.input(f"ground_frame/{pair}", "rig").meta["rig"])
             disparity = self._run.one(f"hfvm/{pair}")
             found = points(disparity, rig, self._every)
-            yield PlacedPair(pair, disparity, found, rig, RigidTransform.from_matrix(self._poses[pair]))
+            yield PlacedPair(pair, disparity, found, rig, self._poses[pair])
+
+
+def placed_frames(trajectory: Bundle) -> dict[int, RigidTransform]:
+    """Pose T_world_left of each frame that has one in the world."""
+    rows = zip(trajectory.meta["frames"], world_poses(trajectory), strict=True)
+    return {int(frame): RigidTransform.from_matrix(pose) for frame, pose in rows if np.isfinite(pose).all()}

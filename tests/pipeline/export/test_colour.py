@@ -37,7 +37,7 @@ class View:
         }
         self.bundle = lambda name: made.get(name)
         self.products = type("Products", (), {
-            "images": {0: "image0", 1: "image1"}, "undistorted": {}, "trajectory": "trajectory", "rigs": {},
+            "images": {0: "image0", 1: "image1"}, "trajectory": "trajectory", "rigs": {},
         })  # fmt: skip
         self.sequence = type("Sequence", (), {"rig": rig})
 

@@ -25,11 +25,11 @@ from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import Output, pack, unpack
-from rille.pipeline.export.output_task import add, handles
 from rille.pipeline.export.view import part
 from rille.pipeline.report import canvas, gallery
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.runs import run_files
+from rille.pipeline.runs.run_files import add, handles
 from rille.stages.core.declare import Bundle
 
 ROOT = Path(__file__).parents[3]

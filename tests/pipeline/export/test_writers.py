@@ -20,7 +20,7 @@ from rille.pipeline.export.catalogue import describe
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.writers import (
     Meaning,
-    write_disparity,
+    write_image,
     write_raster,
     write_table,
     write_trajectory_kitti,
@@ -60,7 +60,7 @@ def test_an_elevation_raster_keeps_values_place_and_crs(tmp_path: Path) -> None:
 
 
 def test_a_tag_may_name_a_file_that_is_no_utf8(tmp_path: Path) -> None:
-    write_disparity(tmp_path / "d.tif", np.zeros((2, 3)), np.zeros((2, 3)), {"LEFT": "caf\udce9.png"})
+    write_image(tmp_path / "d.tif", {"a": np.zeros((2, 3))}, Meaning("pixel", tags={"LEFT": "caf\udce9.png"}))
     with rasterio.open(tmp_path / "d.tif") as file:
         assert file.tags()["LEFT"] == "caf\\udce9.png"
 

@@ -16,6 +16,7 @@ from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
 from rille.pipeline.flow.reconstruction import cells_in_both, overlaps, spread
+from rille.stages.geometry.lens import Lens
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box
 
@@ -155,6 +156,18 @@ def test_a_small_right_image_is_expected_to_take_the_room_of_a_left_one() -> Non
         # The other way the large image is the right one: what is there is enough.
         assert make.backward(0).expect == 0.0
     assert expected[0] == pytest.approx(expected[1])
+
+
+def test_the_report_shows_images_free_of_distortion() -> None:
+    sequence = open_sequence("mockup-short", {})
+    make = Builder(Graph(), sequence, config.build({}))
+    assert make.image(0, "left") is make.products.images[0] is make.raw_image(0, "left")
+    lens = Lens(sequence.rig.left, "radtan", (0.1, 0.0, 0.0, 0.0, 0.0))
+    make = Builder(Graph(), replace(sequence, lenses={"left": lens, "right": lens}), config.build({}))
+    make.image(0, "right")
+    assert not make.products.images
+    assert make.image(0, "left") is make.products.images[0]
+    assert make.products.images[0].stage == "undistort"
 
 
 def test_a_model_is_compared_with_those_that_share_most_ground_however_often_a_place_is_seen() -> None:

@@ -22,7 +22,6 @@ from toys.finished import (
 )
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export import artifacts
 from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, summary
 from rille.stages.core.declare import Bundle
@@ -187,15 +186,6 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     assert facts["verdict"].startswith("Complete: one stereo pair")
     assert not {"trajectory", "pairs"} & set(page_.ids)
     assert "trajectory_drift" not in facts["metrics"]
-
-
-def test_images_free_of_distortion_are_shown() -> None:
-    made, handles = bundles() | checks(), checked()
-    made["ideal0"] = Bundle({"image": np.zeros((48, 64), dtype=np.float32)}, {})
-    handles.undistorted = {0: "ideal0"}  # type: ignore[dict-item]
-    run = view(made, products=handles)
-    assert artifacts.image(run, 0) is made["ideal0"]
-    assert artifacts.image(run, 1) is made["image1"]
 
 
 def test_residuals_of_a_part_of_the_image_are_one_median() -> None:

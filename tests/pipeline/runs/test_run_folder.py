@@ -27,10 +27,6 @@ def test_what_is_no_link_to_a_run_is_told_before_anything_is_computed(tmp_path, 
     assert [p.name for p in tmp_path.iterdir()] == ["latest"]
 
 
-def test_quiet_is_a_kind_of_progress():
-    assert session.Options(quiet=True).progress == session.Options(progress="quiet").progress
-
-
 def test_a_folder_that_is_a_broken_link_is_named(tmp_path):
     (tmp_path / "runs").symlink_to("gone/runs")
     with raises("RIL-061", "--runs") as error:

@@ -61,10 +61,12 @@ def disparities(left, right):
     return Bundle({"column_disparity": column, "row_disparity": row, "validity": validity}, {})
 
 
+SHADE = Bundle({"image": np.full((480, 640), 77, np.uint8)}, {})
+
+
 def test_the_model_read_again_has_our_cameras_poses_and_points(tmp_path):
     trajectory, segments, poses, world = parts()
-    shade = Bundle({"image": np.full((480, 640), 77, np.uint8)}, {})
-    build(RIG, trajectory, {3: "a.png"}, segments, {3: shade}).write_text(str(tmp_path))
+    build(RIG, trajectory, {3: "a.png"}, segments, {3: SHADE}).write_text(str(tmp_path))
     again = pycolmap.Reconstruction(str(tmp_path))
     assert again.num_reg_frames() == 2  # the lost frame is left out
     assert again.num_points3D() == 40
@@ -94,7 +96,7 @@ def test_an_adjustment_of_the_model_keeps_its_scale():
     trajectory, segments, poses, _ = parts()
     noise = np.random.default_rng(1).normal(0, 0.3, segments[0].track["points"].shape)
     track = Bundle({"points": segments[0].track["points"] + noise.astype(np.float32)}, segments[0].track.meta)
-    model = build(RIG, trajectory, {}, [segments[0]._replace(track=track)])
+    model = build(RIG, trajectory, {}, [segments[0]._replace(track=track)], {3: SHADE})
     for point in model.points3D.values():
         point.xyz *= 1.05
     options = pycolmap.BundleAdjustmentOptions()
