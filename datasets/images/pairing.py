@@ -30,9 +30,11 @@ SHARE, MOST_APART = 0.25, 0.01
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
     *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"), ("sinistra", "destra")),
-    *((f"{name}0", f"{name}1") for name in ("cam", "cam_", "camera", "camera_", "image_", "image_0", "im", "view")),
+    *((f"{name}{mark}0", f"{name}{mark}1") for name in ("cam", "camera") for mark in ("", "_", "-")),
+    *((f"{name}0", f"{name}1") for name in ("image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
     *((f"{name}1", f"{name}2") for name in ("infra", "i")),
+    ("lcam", "rcam"),
     ("l", "r"),
 )
 """Tokens that name the left and the right camera in file and folder names, the surest first."""
@@ -202,17 +204,21 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07.
+    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/A_07 and B/B_07.
 
-    In natural order of the words; empty unless exactly one position of words does so.
+    In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside.
     """
     found = []
     words = [re.split(r"([^\W_]+)", name) for name in names]
-    for k in range(1, min(map(len, words), default=0), 2):
+    places = range(1, min(map(len, words), default=0), 2)
+    for k in places:
         kinds = sorted({split[k] for split in words}, key=natural)
+        repeated = [j for j in places if len(kinds) == 2 and all(split[j] == split[k] for split in words)]
+        if repeated[:1] != [k]:
+            continue
         parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
-        rest = [{tuple(words[i][:k] + words[i][k + 1 :]) for i in of} for of in parts.values()]
-        if len(kinds) == 2 and rest[0] == rest[1] and len(rest[0]) > 1:
+        rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
+        if rest[0] == rest[1] and len(rest[0]) > 1:
             found.append(parts)
     return found[0] if len(found) == 1 else {}
 

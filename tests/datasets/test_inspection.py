@@ -54,6 +54,10 @@ def both(template: str, names: list[str]) -> list[str]:
     return [template.format(side=side, name=name) for name in names for side in ("left", "right")]
 
 
+CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
+LCAM = "image_lcam/*.png", "image_rcam/*.png"
+
+
 @pytest.mark.parametrize(
     ("files", "left", "right", "pairs"),
     [
@@ -74,6 +78,8 @@ def both(template: str, names: list[str]) -> list[str]:
         (both("a/{name}/{side}/x.png", ["9", "10"]), "a/*/left/x.png", "a/*/right/x.png", 2),
         ([f"{k:03d}/v_{c}.png" for k in range(3) for c in (3, 4)], "*/v_3.png", "*/v_4.png", 3),
         (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
+        ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
+        ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
     ],
 )
 def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
@@ -106,12 +112,14 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
     [
         ("A/{}.png", "B/{}.png", ("A/*.png", "B/*.png")),
         ("cam1/{}.png", "cam2/{}.png", ("cam1/*.png", "cam2/*.png")),
+        ("cam1/cam1_{}.png", "cam2/cam2_{}.png", ("cam1/cam1_*.png", "cam2/cam2_*.png")),
+        ("A/image_{}.png", "B/image_{}.png", ("A/image_*.png", "B/image_*.png")),
         ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
         ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
     ],
 )
 def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, left, right, patterns):
-    write_images(tmp_path, [name.format(k) for k in (1, 2, 3) for name in (left, right)])
+    write_images(tmp_path, [name.format(k) for k in (0, 1, 2) for name in (left, right)])
     (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
     found = inspect(tmp_path)
     assert (found.views.pairs, found.views.trouble) == (3, "")
@@ -153,6 +161,11 @@ def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path, ["1.png", "2.png"])
     with raises("RIL-194", "2 images, 0 named as left and 0 as right"):
         inspect(tmp_path)
+    write_images(tmp_path / "high", ["1.png"], (48, 64))
+    with raises("RIL-194", "one above the other, crop=iw:ih/2"):
+        inspect(tmp_path / "high")
+    write_images(tmp_path / "one", [f"image_{k}.png" for k in range(4)])
+    assert "'image_0' and 'image_1' are taken for two cameras" in inspect(tmp_path / "one").views.lines[0]
     with raises("RIL-193"):
         inspect(tmp_path / "nothing")
     with raises("RIL-193", "ZED SDK"):
@@ -245,6 +258,19 @@ def test_what_is_recognised_and_refused_is_told(tmp_path):
     assert [line.partition(": ")[0].rpartition("/")[2] for line in found.unread] == ["P.txt", "cam0.yaml", "times.txt"]
     assert "MEI" in found.unread[1]
     assert all("decimal commas" in found.unread[k] for k in (0, 2))
+
+
+def test_texts_that_seem_to_describe_cameras_are_told_once_with_what_to_write_instead(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    write_lines(tmp_path / "calib_0.txt", ["Pinhole 1 2 3 4 0"])
+    write_lines(tmp_path / "transforms.json", ['{"fl_x": 460.0}'])
+    write_lines(tmp_path / "notes.txt", ["dusty"])
+    found = inspect(tmp_path)
+    assert [line.partition(":")[0] for line in found.unread] == [
+        "2 calibrations (calib_0.txt and 1 more)",
+        "1 file (notes.txt)",
+    ]
+    assert "of another program write fx, fy, cx, cy and baseline" in found.unread[0]
 
 
 def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
