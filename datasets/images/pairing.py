@@ -17,7 +17,7 @@ import numpy as np
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
 from rille.datasets.text.count import count
-from rille.datasets.text.times import seconds
+from rille.datasets.text.times import seconds, undated
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import IncompleteError, InputError
 
@@ -59,12 +59,14 @@ class TimedPairs(NamedTuple):
     alone : number of images without a partner.
     apart : s; longest time between the images of a pair; between the nearest ones if there is no pair.
     allowed : s; its limit.
+    two_clocks : whether no images are simultaneous, and all are apart alike, by the share of the interval at most.
     """
 
     places: list[tuple[int, int]]
     alone: int
     apart: float
     allowed: float
+    two_clocks: bool = False
 
     def lines(self, code: str) -> list[str]:
         """A warning if images have no partner, or those of a pair are not simultaneous."""
@@ -89,7 +91,10 @@ def join(left: Sequence[float], right: Sequence[float], tolerance: float | None 
     # Each must be the other's nearest, else one image would be in two pairs.
     there = np.flatnonzero((theirs[ours] == np.arange(len(a))) & (apart <= allowed))
     longest = float(max(apart[there], default=apart.min()))
-    return TimedPairs([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
+    later = b - a if len(a) == len(b) > 2 and not len(there) else np.array([0.0, np.inf])
+    alike = float(np.ptp(later)) <= allowed and abs(float(np.median(later))) <= SHARE * min(intervals)
+    places = [(int(i), int(ours[i])) for i in there]
+    return TimedPairs(places, len(a) + len(b) - 2 * len(there), longest, allowed, alike)
 
 
 def stamp_of(name: str) -> str:
@@ -99,10 +104,13 @@ def stamp_of(name: str) -> str:
 
 
 def _times(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Times in the names of sorted files, s; empty unless each has its own."""
-    stamps = [stamp for path in paths if (stamp := stamp_of(path.stem))]
+    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has its own."""
+    stamps = [stamp for path in paths if (stamp := stamp_of(undated(path.stem)))]
     with suppress(InputError):
-        return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
+        times = seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
+        # 0.002 s: what increases by ones of a millisecond or less after a date is a counter.
+        counts = len(times) > 1 and not stamp_of(paths[0].stem) and np.median(np.diff(times)) < 0.002
+        return () if counts else times
     return ()
 
 
@@ -301,7 +309,9 @@ def pair_up(
     if alone:
         more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
         text = f"{alone[0]} has no partner by {rule}{more}; {both}"
-        remedy = "add the missing image, narrow the patterns, or choose another images.pair"
+        remedy = "add the missing image, or narrow the patterns"
+        if len(left) == len(right):
+            remedy = f'if they belong together in order of their names, state images.pair = "order"; else {remedy}'
         raise IncompleteError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
@@ -315,7 +325,7 @@ def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, s
         return "folder"
     shared = {names[path] for path in left} & {names[path] for path in right}
     if joined is not None and (joined.apart or not shared):
-        return "nearest"
+        return "order" if joined.two_clocks else "nearest"
     return "name" if shared else "number"
 
 
