@@ -309,9 +309,8 @@ def pair_up(
     if alone:
         more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
         text = f"{alone[0]} has no partner by {rule}{more}; {both}"
-        remedy = "add the missing image, or narrow the patterns"
-        if len(left) == len(right):
-            remedy = f'if they belong together in order of their names, state images.pair = "order"; else {remedy}'
+        order = 'state images.pair = "order" if they belong together in order of their names; else '
+        remedy = f"{order if len(left) == len(right) else ''}add the missing image, or narrow the patterns"
         raise IncompleteError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
