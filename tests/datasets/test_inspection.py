@@ -164,6 +164,12 @@ def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path / "high", ["1.png"], (48, 64))
     with raises("RIL-194", "one above the other, crop=iw:ih/2"):
         inspect(tmp_path / "high")
+    (tmp_path / "videos" / "a" / "b" / "c" / "d" / "e").mkdir(parents=True)
+    with raises("RIL-194", "0 images", "(4 folders deep): name the folder that holds the images"):
+        inspect(tmp_path / "videos")
+    (tmp_path / "videos" / "left.mp4").touch()
+    with raises("RIL-194", "(4 folders deep): 1 video (left.mp4): take its images out"):
+        inspect(tmp_path / "videos")
     write_images(tmp_path / "one", [f"image_{k}.png" for k in range(4)])
     assert "'image_0' and 'image_1' are taken for two cameras" in inspect(tmp_path / "one").views.lines[0]
     with raises("RIL-193"):
@@ -656,6 +662,12 @@ def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path, place)
     write_images(tmp_path / "wide", [f"{place}1.png", f"{place}2.png"], (128, 48))
     with raises("RIL-194", "if each shows both views: mkdir left right; ffmpeg"):
         inspect(tmp_path / "wide")
+    (tmp_path / "videos" / "a" / "b" / "c" / "d" / "e").mkdir(parents=True)
+    with raises("RIL-194", "0 images", "(4 folders deep): name the folder that holds the images"):
+        inspect(tmp_path / "videos")
+    (tmp_path / "videos" / "left.mp4").touch()
+    with raises("RIL-194", "(4 folders deep): 1 video (left.mp4): take its images out"):
+        inspect(tmp_path / "videos")
     write_images(tmp_path / "one", ["1.png"])
     with pytest.raises(InputError) as caught:
         inspect(tmp_path / "one")
