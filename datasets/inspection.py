@@ -24,7 +24,7 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
+from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
@@ -386,6 +386,8 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
+    if untimed(table) and len(table.rows) == pairs:
+        return "truth"
     if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None

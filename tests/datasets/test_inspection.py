@@ -205,6 +205,8 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"] * 2, "truth"),
         (["0.1 0.6 0.8 0 9 -0.8 0.6 0 8 0 0 1 7"] * 2, "truth"),
         (["700 0 30 0 0 700 20 0 0 0 1 0"] * 2, ""),
+        (["5 0 0 0 0 0.6 0.8"] * 2, "truth"),
+        (["5 0 0 0 0 0.6 0.8"] * 3, ""),
         (["t,ax,ay,az,gx,gy,gz", "140,0,0,9.8,0.1,-3.6,0"], "imu"),
         (["# time x y z qx qy qz qw", "0.1 0 0 0 0 0 0.6 0.8"], "truth"),
         (["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z", "1403,0.9,2.2,0.9,0.8,0.6,0.0,0.0,0.1,0.2"], "truth"),
