@@ -134,10 +134,10 @@ def inspect(folder: Path) -> Findings:
     try:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     except InputError as error:
-        text, told = "; ".join([error.message, *search.closed[:1]]), unread(strange)
+        text, lines = "; ".join([error.message, *search.closed[:1]]), unread(strange)
         if any(map(hints, strange)) and not any(p.suffix.lower() in SUFFIXES for p in paths):
-            raise InputError(error.code, text, remedy="; ".join(told)) from error
-        raise InputError(error.code, "; ".join([text, *told]), remedy=error.remedy) from error
+            raise InputError(error.code, text, remedy="; ".join(lines)) from error
+        raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
     found.unread += found.views.others
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
