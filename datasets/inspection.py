@@ -228,10 +228,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
         both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
     # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
-    single = all(min(map(len, sides)) == 1 for sides in both.values())
-    if single and (parts := pairing.by_one_word(names)):
-        (first, ours), (second, theirs) = parts.items()
-        both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
+    parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
+    of_word = [[images[i] for i in of] for of in parts.values()]
+    lefts = {path for left, _ in both.values() for path in left}
+    if parts and not (both and any(lefts <= set(of) for of in of_word)):
+        first, second = parts
+        both, tokens = {(0, ""): (of_word[0], of_word[1])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
@@ -257,12 +259,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    if len(matched) == 1 and len(images) > 2 and sides[0][-1].isdigit():
-        taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
-        lines.append(f"{taken}; if they are frames of one, name its folder left or right")
     others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [_relative(path, folder) for path in images if path not in paired]
+    if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):
+        taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
+        lines.append(f"{taken}; if they are frames of one, name its folder left or right")
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -333,10 +335,20 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
     candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairing.two_sides(single)]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
-        found.calibration = max(
-            candidates, key=lambda c: (c.suits(found.views.sizes), c.cameras, c.baseline is not None, -len(c.files))
-        )
-        found.others = [name for name in read if name not in found.calibration.files]
+        place = Path(found.views.left).parent
+
+        def rank(c: FoundCalibration) -> tuple[int, ...]:
+            above, beside = [place, *place.parents], Path(c.files[0]).parent
+            far = above.index(beside) if beside in above else len(above)
+            return c.suits(found.views.sizes), c.cameras, c.baseline is not None, -far, -len(c.files)
+
+        found.calibration = max(candidates, key=rank)
+        taken = found.calibration.files
+        found.others = [name for name in read if name not in taken]
+        each = [name for name in read if re.sub(r"\d+", "", name) == re.sub(r"\d+", "", taken[0])]
+        unlike = [name for name in each if len(each) == found.views.pairs and str(read[name]) != str(read[taken[0]])]
+        remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
+        found.unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
 
 
 def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:

@@ -78,6 +78,7 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         (both("a/{name}/{side}/x.png", ["9", "10"]), "a/*/left/x.png", "a/*/right/x.png", 2),
         ([f"{k:03d}/v_{c}.png" for k in range(3) for c in (3, 4)], "*/v_3.png", "*/v_4.png", 3),
         (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
+        ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
         ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
         ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
     ],
@@ -340,6 +341,31 @@ def test_calibration_of_both_cameras_is_preferred(tmp_path):
     assert calibration is not None
     assert calibration.files == ("rig.yaml",)
     assert calibration.baseline == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("image", "calibration"), [("{k}/im{c}.png", "{k}/calib.yaml"), ("im{c}/{k}.png", "calib/00{k}.yaml")]
+)
+def test_calibrations_of_each_pair_that_differ_are_told(tmp_path, image, calibration):
+    write_images(tmp_path, [image.format(k=k, c=c) for k in range(3) for c in (0, 1)])
+    for k, bf in enumerate((6.0, 6.0, 7.0)):
+        path = tmp_path / calibration.format(k=k)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(ORB_SETTINGS.format(*SIZE, bf=bf))
+    (line,) = inspect(tmp_path).unread
+    assert line.startswith(f"1 calibration ({calibration.format(k=2)}): unlike {calibration.format(k=0)}")
+
+
+def test_of_several_scenes_one_is_taken_with_its_own_calibration(tmp_path):
+    scenes = ("delivery", "forest", "playground")
+    write_images(tmp_path, [f"{scene}/im{c}.png" for scene in scenes for c in (0, 1)])
+    for scene in scenes:
+        (tmp_path / scene / "calib.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0 + len(scene)))
+    found = inspect(tmp_path)
+    assert found.views.left == "forest/im0.png"
+    assert found.calibration is not None
+    assert found.calibration.files == ("forest/calib.yaml",)
+    assert "calib" not in " ".join(found.unread)
 
 
 def test_both_files_of_opencvs_sample_are_read(tmp_path):
