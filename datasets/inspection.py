@@ -238,7 +238,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
         counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
-        remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
+        named = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
+        remedy = f"give the folder of both cameras, {named}, or write a manifest by hand"
         for path in images[: 1 if sum(counts) in (0, len(images)) and not all(counts) else 0]:
             with suppress(InputError):
                 header = common_header([path]).header
