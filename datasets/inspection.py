@@ -227,6 +227,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
         alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
         both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
+    sets = [[key for key, sides in groups.items() if sides[side]] for side in (0, 1)]
+    if not both and all(len(keys) == 1 for keys in sets) and sets[0][0][0] == sets[1][0][0]:  # colour_left, mono_right
+        both = {sets[0][0]: (groups[sets[0][0]][0], groups[sets[1][0]][1])}
     # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
     parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
     of_word = [[images[i] for i in of] for of in parts.values()]
@@ -238,8 +241,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
         counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
-        named = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
-        remedy = f"give the folder of both cameras, {named}, or write a manifest by hand"
+        called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
+        remedy = f"give the folder of both cameras, {called}, or write a manifest by hand"
         for path in images[: 1 if sum(counts) in (0, len(images)) and not all(counts) else 0]:
             with suppress(InputError):
                 header = common_header([path]).header

@@ -30,6 +30,7 @@ SHARE, MOST_APART = 0.25, 0.01
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
     *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"), ("sinistra", "destra")),
+    ("左", "右"),
     *((f"{name}{mark}0", f"{name}{mark}1") for name in ("cam", "camera") for mark in ("", "_", "-")),
     *((f"{name}0", f"{name}1") for name in ("image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),

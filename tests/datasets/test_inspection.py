@@ -78,6 +78,8 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         (both("a/{name}/{side}/x.png", ["9", "10"]), "a/*/left/x.png", "a/*/right/x.png", 2),
         ([f"{k:03d}/v_{c}.png" for k in range(3) for c in (3, 4)], "*/v_3.png", "*/v_4.png", 3),
         (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
+        ([f"{c}/{k}.png" for c in ("rgb_left", "mono_right") for k in (1, 2)], "rgb_left/*.png", "mono_right/*.png", 2),
+        ([f"{c}/{k}.png" for c in "右左" for k in (1, 2)], "左/*.png", "右/*.png", 2),
         ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
         ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
         ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
