@@ -105,13 +105,13 @@ def stamp_of(name: str) -> str:
 
 
 def _times(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has its own."""
+    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has one."""
     stamps = [stamp for path in paths if (stamp := stamp_of(undated(path.stem)))]
     with suppress(InputError):
         times = seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
-        # 0.002 s: what increases by ones of a millisecond or less after a date is a counter.
-        counts = len(times) > 1 and not stamp_of(paths[0].stem) and np.median(np.diff(times)) < 0.002
-        return () if counts else times
+        # Whole seconds tell no pairs. 0.002 s: what increases by a millisecond or less after a date is a counter.
+        coarse = all(map(float.is_integer, times)) or (len(times) > 1 and np.median(np.diff(times)) < 0.002)
+        return () if coarse and not stamp_of(paths[0].stem) else times
     return ()
 
 

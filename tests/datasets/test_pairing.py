@@ -316,6 +316,13 @@ def test_dates_apart_by_a_constant_are_pairs(form, later):
         pair_up(left[:-1], [p.with_name(p.name.replace("2024", "2025")) for p in right])
 
 
+def test_whole_seconds_tell_no_pairs():
+    """The right image of a pair may be written a second later."""
+    names = [(f"l/20231104_1015{k}0_{k}111.png", f"r/20231104_1015{k}{k}_{k}111.png") for k in (1, 2, 3)]
+    left, right = ([Path(name) for name in of] for of in zip(*names, strict=True))
+    assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
+
+
 def test_a_counter_after_a_date_is_no_time():
     left, right = ([Path(f"{s}/20231104_101500_{k:06d}{s}.png") for k in range(5, 9)] for s in "xy")
     assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
