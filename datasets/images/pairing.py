@@ -323,10 +323,12 @@ def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, s
         return "order"
     if len({path.name for path in left}) == len({path.name for path in right}) == 1:
         return "folder"
-    shared = {names[path] for path in left} & {names[path] for path in right}
+    ours, theirs = ({names[path] for path in of} for of in (left, right))
+    shared = ours & theirs
     if joined is not None and (joined.apart or not shared):
         return "order" if joined.two_clocks else "nearest"
-    return "name" if shared else "number"
+    # Where as many images share few names (of seconds that tick between), numbers tell more.
+    return "name" if shared and (2 * len(shared) > len(ours | theirs) or len(ours) != len(theirs)) else "number"
 
 
 def _sorted(paths: Sequence[Path], names: Mapping[Path, str]) -> list[Path]:

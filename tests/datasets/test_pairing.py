@@ -318,7 +318,7 @@ def test_dates_apart_by_a_constant_are_pairs(form, later):
 
 def test_whole_seconds_tell_no_pairs():
     """The right image of a pair may be written a second later."""
-    names = [(f"l/20231104_1015{k}0_{k}111.png", f"r/20231104_1015{k}{k}_{k}111.png") for k in (1, 2, 3)]
+    names = [(f"l/20231104_1015{k}0_{k}111.png", f"r/20231104_1015{k}{k}_{k}111.png") for k in range(4)]
     left, right = ([Path(name) for name in of] for of in zip(*names, strict=True))
     assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
 
