@@ -21,12 +21,12 @@ from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import hints, split, unread
+from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of
+from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
 from rille.datasets.text.count import count
-from rille.datasets.text.reading import Search, is_file, read_toml
+from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -34,10 +34,18 @@ from rille.stages.geometry.geometry import RigidTransform, Sizes
 DEPTH = 4
 """Levels of folders that are searched; deeper ones are other data sets."""
 
-CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json")
+CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json", ".cameramodel")
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
+
+COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|flow|label|conf|normal)", re.I)
+"""In the names of images that are no photographs, as beside those of simulators."""
+
+CAMERA_WORDS = re.compile(
+    r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl](_[xy])?\b", re.I
+)
+"""In the name or the text of a file that seems to describe cameras."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +134,10 @@ def inspect(folder: Path) -> Findings:
     try:
         found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
     except InputError as error:
-        text = "; ".join([error.message, *search.closed[:1], *unread(strange)])
-        raise InputError(error.code, text, remedy=error.remedy) from error
+        text, lines = "; ".join([error.message, *search.closed[:1]]), unread(strange)
+        if any(map(hints, strange)) and not any(p.suffix.lower() in SUFFIXES for p in paths):
+            raise InputError(error.code, text, remedy="; ".join(lines)) from error
+        raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
     found.unread += found.views.others
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
@@ -152,8 +162,18 @@ def inspect(folder: Path) -> Findings:
             used.add(relative)
     told = " ".join(found.unread)
     unknown = [_relative(p, folder) for p in texts if _relative(p, folder) not in used and str(p) not in told]
-    found.unread += unread(unknown + strange)
+    cameras = [name for name in unknown if _of_cameras(folder / name)]
+    found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
+    found.unread += unread([name for name in unknown if name not in cameras] + strange)
     return found
+
+
+def _of_cameras(path: Path) -> bool:
+    """Whether a text of no known form seems to describe cameras, by its name or by a word in it."""
+    with suppress(InputError):
+        text = path.stem if path.suffix.lower() not in CALIBRATIONS else path.stem + read_text(path, "file")
+        return CAMERA_WORDS.search(text) is not None
+    return False
 
 
 def _files(folder: Path, search: Search) -> list[Path]:
@@ -196,7 +216,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
             row, side, neutral = at
             named[row, _place(path, neutral)].append((neutral, side, path))
     for (row, place), found in named.items():
-        neutrals = list(dict.fromkeys(neutral for neutral, _, _ in found))
+        of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
+        neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
         words = {neutrals[i]: word for word, of in pairing.by_one_word(neutrals).items() for i in of}
         for neutral, side, path in found:
@@ -206,25 +227,33 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
         alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
         both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
-    if not both and (parts := pairing.by_one_word(names)):
-        (first, ours), (second, theirs) = parts.items()
-        both, tokens = {(0, ""): ([images[i] for i in ours], [images[i] for i in theirs])}, ((first, second),)
+    sets = [[key for key, sides in groups.items() if sides[side]] for side in (0, 1)]
+    if not both and all(len(keys) == 1 for keys in sets) and sets[0][0][0] == sets[1][0][0]:  # colour_left, mono_right
+        both = {sets[0][0]: (groups[sets[0][0]][0], groups[sets[1][0]][1])}
+    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
+    parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
+    of_word = [[images[i] for i in of] for of in parts.values()]
+    lefts = {path for left, _ in both.values() for path in left}
+    if parts and not (both and any(lefts <= set(of) for of in of_word)):
+        first, second = parts
+        both, tokens = {(0, ""): (of_word[0], of_word[1])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
         counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
-        remedy = "name files or folders left and right (or _l and _r, cam0 and cam1), or write a manifest by hand"
+        called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
+        remedy = f"give the folder of both cameras, {called}, or write a manifest by hand"
         for path in images[: 1 if sum(counts) in (0, len(images)) and not all(counts) else 0]:
             with suppress(InputError):
                 header = common_header([path]).header
-                remedy = (
-                    f"{split('each shows', 'FILE')}; else {remedy}" if header.width >= 2 * header.height else remedy
-                )
+                if not header.height <= header.width < 2 * header.height:
+                    remedy = f"{split('each shows', 'FILE')}; else {remedy}"
+        remedy = remedy if images else "name the folder that holds the images, or a folder nearer to them"
         text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
         text += "" if images else f" ({DEPTH} folders deep)"
         raise InputError("RIL-194", text, remedy=remedy)
-    # Most pairs first; of equally many the surest token (SIDES), and the shortest name: left before left_depth.
-    key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
+    # Photographs first, then most pairs; of equally many the surest token (SIDES), and the shortest name.
+    key = max(both, key=lambda k: (not COMPUTED.search(k[1]), min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
     sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
@@ -237,6 +266,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [_relative(path, folder) for path in images if path not in paired]
+    if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):
+        taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
+        lines.append(f"{taken}; if they are frames of one, name its folder left or right")
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -291,7 +323,8 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             # Most text files are tables, or something else; a file refused for its lens is a calibration.
             other = path.suffix.lower() in TABLES or (isinstance(error, RilleError) and error.remedy == KNOWN)
             refused = re.match(r"RIL-(81\d|120|135)", getattr(error, "code", ""))
-            if refused or "calib" in path.stem.lower() or not other:
+            named = "calib" in path.stem.lower() and getattr(error, "remedy", "") != KNOWN
+            if refused or named or not other:
                 found.unread.append(" ".join(str(error).split()))
             continue
         if cameras:
@@ -306,10 +339,20 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
     candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairing.two_sides(single)]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
-        found.calibration = max(
-            candidates, key=lambda c: (c.suits(found.views.sizes), c.cameras, c.baseline is not None, -len(c.files))
-        )
-        found.others = [name for name in read if name not in found.calibration.files]
+        place = Path(found.views.left).parent
+
+        def rank(c: FoundCalibration) -> tuple[int, ...]:
+            above, beside = [place, *place.parents], Path(c.files[0]).parent
+            far = above.index(beside) if beside in above else len(above)
+            return c.suits(found.views.sizes), c.cameras, c.baseline is not None, -far, -len(c.files)
+
+        found.calibration = max(candidates, key=rank)
+        taken = found.calibration.files
+        found.others = [name for name in read if name not in taken]
+        each = [name for name in read if re.sub(r"\d+", "", name) == re.sub(r"\d+", "", taken[0])]
+        unlike = [name for name in each if len(each) == found.views.pairs and str(read[name]) != str(read[taken[0]])]
+        remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
+        found.unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
 
 
 def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
@@ -359,6 +402,8 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header:
         return "attitude"
+    if untimed(table) and len(table.rows) == pairs:
+        return "truth"
     if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None

@@ -3,8 +3,8 @@
 Forms of a file, one pose T_reference_body per row:
 
 * ``kitti``: 3 x 4 (or 4 x 4) numbers, row by row (4 x 4 perhaps column by column), perhaps after a time;
-* ``tum``: time, x y z, quaternion x y z w;
-* ``euroc``: time, x y z, quaternion w x y z, perhaps other columns;
+* ``tum``: time (or none, one row a frame), x y z, quaternion x y z w;
+* ``euroc``: time (or none), x y z, quaternion w x y z, perhaps other columns;
 * ``csv``: columns by name in any order: a time (``t``, ``time``, ``timestamp``), quaternion ``qw qx qy qz`` or angles
   ``roll pitch yaw`` with their unit (``roll_deg``, ``yaw [rad]``), and perhaps a position ``x y z`` (``px``, ``tx``);
   of a robot on a plane ``x y`` and ``yaw`` or ``theta``;
@@ -233,7 +233,8 @@ def positions_of(
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
-    posed = _whole(meant) or (len(known) < 2 and table.columns >= len(ORDERED["tum"])) or matrix_at(table) is not None
+    many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
+    posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
     if not columns and posed:
         return None
     if len(known) < 2 or any(NOT_IN_PLANE.search(table.header[meant[axis]]) for axis in known if table.header):
@@ -331,6 +332,13 @@ def _whole(columns: Mapping[str, int]) -> bool:
     return set(QUATERNION) <= set(columns) or set(ANGLES) <= set(columns)
 
 
+def untimed(table: TextTable) -> bool:
+    """Whether rows are x y z and a quaternion of length 1, one a frame."""
+    if table.header or table.columns != len(ORDERED["tum"]) - 1:
+        return False
+    return bool(np.allclose(np.linalg.norm(table.values(range(3, 7)), axis=1), 1.0, atol=1e-3))
+
+
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
     """Columns of poses, by their names or in the order of the format."""
     if format in ("auto", "csv"):
@@ -342,12 +350,13 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
-    bare = table.commas and table.columns == len(ORDERED["tum"]) and not STAMP.fullmatch(table.rows[0][0])
+    frames = untimed(table)
+    bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])
     if format == "auto" and bare:
         text = f"{table.name}: nothing says whether its quaternions are x, y, z, w or w, x, y, z"
         remedy = 'name its columns, or state format = "tum" (w last) or "euroc" (w first)'
         raise InputError("RIL-745", text, remedy=remedy)
-    order = ORDERED.get(form, ())
+    order = ORDERED.get(form, ())[frames:]
     more = table.columns > len(order) and (form == "tum" or (format == "auto" and table.header))  # of other meaning
     if not order or table.columns < len(order) or more:
         seen = f"columns {', '.join(table.header)}" if table.header else f"{table.columns} numbers"

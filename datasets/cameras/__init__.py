@@ -19,8 +19,8 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, "
-    "BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, Middlebury calib.txt, KITTI, K.txt, "
-    "ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read; of another program write fx, fy, "
+    "mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, Middlebury calib.txt, KITTI, "
+    "K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read; of another program write fx, fy, "
     "cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R transposed), as OpenCV's YAML"
 )
 
@@ -39,6 +39,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
+    (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: 'Intrinsic of "Infrared 1"' in text, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
     (lambda text: bool(makers.numbers_of_matrix(text)), makers.matrix),

@@ -29,13 +29,15 @@ MODELS: Mapping[str, str] = {
         "radtan": "radtan radialtangential plumbbob brown brownconrady opencv",
         "rational": "rational rationalpolynomial fullopencv",
         "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8",
+        "realsense": "inversebrownconrady modifiedbrownconrady ftheta",
         "unread": "omni omnidirectional mei ucm eucm ds doublesphere fov atan scaramuzza fisheye62 fisheye624",
     }.items()
     for name in names.split()
 }
 """Names of the lens models of :mod:`rille.stages.geometry.lens` in other programs, in small letters and digits alone.
 
-Names of "" do not tell the distortion; those of "unread" are unsupported models.
+Names of "" do not tell the distortion; those of "unread" are unsupported models, and so are those of "realsense",
+unless all coefficients are 0 (its inverse model takes off by the formula that puts on elsewhere).
 """
 
 LENS = re.compile(
@@ -50,6 +52,8 @@ COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radi
 
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
 """Part of keys that only look like those of a lens: of its errors, or of names."""
+
+NOT_ZERO = re.compile(r"[-+]?[0.]*[1-9]")
 
 
 class Fields:
@@ -196,6 +200,8 @@ class Fields:
         # ROS writes five zeros for cameras without distortion, whatever the model.
         if stated == "fisheye" or (stated and any(coefficients)):
             model = stated
+        if model == "fisheye" and not any(coefficients[4:]):
+            coefficients = coefficients[:4]  # RealSense lists five
         return self.lens(key, camera, model, coefficients)
 
     def model(self, coefficients: str) -> str:
@@ -213,9 +219,11 @@ class Fields:
         named = {key: model for key, value in self.values.items() if (model := _named(key, value))}
         self.used |= {self.at + key for key in named}
         keys = {model: key for key, model in named.items()}
-        if "unread" in keys:
-            text = f"= {_shown(self.values[keys['unread']])} is a lens model that is not read"
-            raise self.error("RIL-120", keys["unread"], text, "calibrate as radial-tangential or equidistant")
+        if not any(map(NOT_ZERO.match, map(str, _flat(self.values.get(coefficients)) or "1"))):
+            keys.pop("realsense", None)
+        if unread := keys.get("unread", keys.get("realsense")):
+            text = f"= {_shown(self.values[unread])} is a lens model that is not read"
+            raise self.error("RIL-120", unread, text, "calibrate as radial-tangential or equidistant")
         if len(keys) > 1:
             text = f"name two lens models, {' and '.join(keys)}"
             raise self.error("RIL-811", " and ".join(keys.values()), text, "keep the one that was calibrated")
@@ -273,15 +281,17 @@ def _named(key: str, value: Any) -> str:
     """Lens model that an entry names; "unread" if it is unsupported, empty if it names none."""
     if OTHER.search(key) or isinstance(value, Mapping | list) or value is None:
         return ""
-    word = re.sub(r"[^a-z0-9]", "", str(value).lower())
+    word = re.sub(r"[^a-z0-9]|^(rs2_)?distortion[._]", "", str(value).lower())
     if "fish" in key.lower() and word in ("1", "true", "yes"):
         return "fisheye"
     if word in ("", "false", "no") or word[0].isdigit():
         return ""
     # Kalibr's command line has pinhole-equi.
-    model, certain = MODELS.get(word.removeprefix("pinhole") or word, "unread"), LENS.search(key)
+    # A plain "model" may be that of the camera.
+    of_lens = LENS.search(key) or (key.lower() == "model" and (word in MODELS or LENS.search(str(value))))
+    model = MODELS.get(word.removeprefix("pinhole") or word, "unread")
     # With any other key only unambiguous words; short ones may mean something else.
-    return model if certain or (word in MODELS and len(word) > 3 and model in ("fisheye", "unread")) else ""
+    return model if of_lens or (word in MODELS and len(word) > 3 and model in ("fisheye", "unread")) else ""
 
 
 def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tuple[str, Any]]:
@@ -292,8 +302,7 @@ def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tup
             yield from _untaken(value, f"{path}.", used)
         elif path not in used and not OTHER.search(path):
             of_lens = (LENS if flat is not None and len(flat) > 1 else COEFFICIENT).search(key)
-            not_zero = any(re.match(r"[-+]?[0.]*[1-9]", str(v)) for v in flat or [value])
-            if _named(key, value) or (of_lens and not_zero):
+            if _named(key, value) or (of_lens and any(map(NOT_ZERO.match, map(str, flat or [value])))):
                 yield path, value
 
 

@@ -161,7 +161,7 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
     return figures(Fields(values, str(path)), path)
 
 
-GROUP = re.compile(r"(in|ex)trinsics?")
+GROUP = re.compile(r"(in|ex)trinsics?|camera|stereo|rig|calibration")
 TURN = re.compile(
     r"R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|T_(right_left|left_right)|toe_?in\w*", re.I
 )
@@ -169,7 +169,7 @@ TURN = re.compile(
 
 
 def _flat(f: Fields) -> Fields:
-    """Entries with those of the parts ``intrinsic`` and ``extrinsic`` (or in plural) among them."""
+    """Entries with those of the parts ``intrinsic``, ``extrinsic``, ``camera`` and the like among them."""
     parts = {key: value for key, value in f.values.items() if GROUP.fullmatch(key) and isinstance(value, Mapping)}
     flat = {key: value for part in parts.values() for key, value in part.items()}
     return Fields({**{k: v for k, v in f.values.items() if k not in parts}, **flat}, f.file, f.at, f.used)
@@ -198,6 +198,10 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
     """
     lenses = []
     for part in _parts(f):
+        if "coeffs" in part and "model" in part:  # as RealSense's library states them
+            camera = part.optics(f"fx fy {_centre(part)}", "none", "", part.size("width", "height")).camera
+            lenses.append(part.distorted("coeffs", camera))
+            continue
         fisheye = part.model("k1") == "fisheye"
         model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("radtan", "k1 k2 p1 p2 k3")
         lenses.append(part.optics(f"fx fy {_centre(part)}", model, keys, part.size("width", "height")))

@@ -1,4 +1,4 @@
-"""Calibrations of visual-inertial programs: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS and Basalt."""
+"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt and mrcal."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
 CAMERA = re.compile(r"cam(\d+)")
@@ -31,6 +31,9 @@ CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
 }
 """Models of camodocal: keys of the pinhole part, model of :mod:`rille.stages.geometry.lens`, keys of its coefficients.
 """
+
+MRCAL = re.compile(r"'(\w+)'[ \t]*:[ \t]*(?:'(\w+)'|\[([^][]*)\])")
+"""An entry of mrcal's: a name, or a list."""
 
 
 def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -108,6 +111,19 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
         T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
         found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
     return found
+
+
+def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
+    """The camera of a ``.cameramodel``; ``extrinsics``: rotation vector and t, x_camera = R x_reference + t, metres."""
+    f = Fields({key: word or row.replace(",", " ").split() for key, word, row in MRCAL.findall(text)}, str(path))
+    kind = f.text("lensmodel")
+    if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV\d+)", kind):
+        raise f.error("RIL-769", "lensmodel", f"= {kind} is not read", "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE")
+    fx, fy, cx, cy, *coefficients = f.numbers("intrinsics")
+    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("imagersize"))
+    rt = np.array(f.numbers("extrinsics", 6))
+    lens = f.lens("intrinsics", camera, *by_count(tuple(coefficients)))
+    return [CalibratedCamera(path.stem, lens, f.rigid("extrinsics", rotation_exp(rt[:3]), rt[3:]))]
 
 
 def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -10,9 +10,11 @@ from rille.datasets.text.count import count
 
 
 def split(what: str, name: str) -> str:
-    """How to take apart a file FILE in which both views stand side by side; ``name``: of each half."""
+    """How to take apart a file FILE in which both views stand side by side, or one above the other; ``name``: of each
+    half."""
     halves = (f"-vf crop=iw/2:ih:{left}:0 {side}/{name}" for side, left in (("left", "0"), ("right", "iw/2")))
-    return f"if {what} both views: mkdir left right; ffmpeg -i FILE {' '.join(halves)}"
+    above = "one above the other, crop=iw:ih/2:0:0 and crop=iw:ih/2:0:ih/2"
+    return f"if {what} both views: mkdir left right; ffmpeg -i FILE {' '.join(halves)} ({above})"
 
 
 KINDS: dict[str, tuple[str, str]] = {
@@ -68,5 +70,10 @@ def unread(names: Iterable[str]) -> list[str]:
     groups: dict[str, list[str]] = defaultdict(list)
     for name in names:
         groups[kind_of(name)].append(name)
-    more = {kind: f" and {len(of) - 1} more" if of[1:] else "" for kind, of in groups.items()}
-    return [f"{count(len(of), kind)} ({of[0]}{more[kind]}): {KINDS[kind][1]}" for kind, of in groups.items()]
+    return [line(kind, of, KINDS[kind][1]) for kind, of in groups.items()]
+
+
+def line(kind: str, names: list[str], remedy: str) -> str:
+    """Files of a kind in one line: their number, the first one, the remedy."""
+    more = f" and {len(names) - 1} more" if names[1:] else ""
+    return f"{count(len(names), kind)} ({names[0]}{more}): {remedy}"

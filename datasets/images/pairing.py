@@ -17,7 +17,7 @@ import numpy as np
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
 from rille.datasets.text.count import count
-from rille.datasets.text.times import seconds
+from rille.datasets.text.times import seconds, undated
 from rille.datasets.text.warning import warning
 from rille.stages.core.errors import IncompleteError, InputError
 
@@ -30,9 +30,12 @@ SHARE, MOST_APART = 0.25, 0.01
 SIDES: tuple[tuple[str, str], ...] = (
     ("left", "right"),
     *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha"), ("sinistra", "destra")),
-    *((f"{name}0", f"{name}1") for name in ("cam", "cam_", "camera", "camera_", "image_", "image_0", "im", "view")),
+    ("左", "右"),
+    *((f"{name}{mark}0", f"{name}{mark}1") for name in ("cam", "camera") for mark in ("", "_", "-")),
+    *((f"{name}0", f"{name}1") for name in ("image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
     *((f"{name}1", f"{name}2") for name in ("infra", "i")),
+    ("lcam", "rcam"),
     ("l", "r"),
 )
 """Tokens that name the left and the right camera in file and folder names, the surest first."""
@@ -57,12 +60,14 @@ class TimedPairs(NamedTuple):
     alone : number of images without a partner.
     apart : s; longest time between the images of a pair; between the nearest ones if there is no pair.
     allowed : s; its limit.
+    two_clocks : whether no images are simultaneous, and all are apart alike, by the share of the interval at most.
     """
 
     places: list[tuple[int, int]]
     alone: int
     apart: float
     allowed: float
+    two_clocks: bool = False
 
     def lines(self, code: str) -> list[str]:
         """A warning if images have no partner, or those of a pair are not simultaneous."""
@@ -87,7 +92,10 @@ def join(left: Sequence[float], right: Sequence[float], tolerance: float | None 
     # Each must be the other's nearest, else one image would be in two pairs.
     there = np.flatnonzero((theirs[ours] == np.arange(len(a))) & (apart <= allowed))
     longest = float(max(apart[there], default=apart.min()))
-    return TimedPairs([(int(i), int(ours[i])) for i in there], len(a) + len(b) - 2 * len(there), longest, allowed)
+    later = b - a if len(a) == len(b) > 2 and not len(there) else np.array([0.0, np.inf])
+    alike = float(np.ptp(later)) <= allowed and abs(float(np.median(later))) <= SHARE * min(intervals)
+    places = [(int(i), int(ours[i])) for i in there]
+    return TimedPairs(places, len(a) + len(b) - 2 * len(there), longest, allowed, alike)
 
 
 def stamp_of(name: str) -> str:
@@ -97,10 +105,13 @@ def stamp_of(name: str) -> str:
 
 
 def _times(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Times in the names of sorted files, s; empty unless each has its own."""
-    stamps = [stamp for path in paths if (stamp := stamp_of(path.stem))]
+    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has one."""
+    stamps = [stamp for path in paths if (stamp := stamp_of(undated(path.stem)))]
     with suppress(InputError):
-        return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
+        times = seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
+        # Whole seconds tell no pairs. 0.002 s: what increases by a millisecond or less after a date is a counter.
+        coarse = all(map(float.is_integer, times)) or (len(times) > 1 and np.median(np.diff(times)) < 0.002)
+        return () if coarse and not stamp_of(paths[0].stem) else times
     return ()
 
 
@@ -202,17 +213,21 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07.
+    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/A_07 and B/B_07.
 
-    In natural order of the words; empty unless exactly one position of words does so.
+    In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside.
     """
     found = []
     words = [re.split(r"([^\W_]+)", name) for name in names]
-    for k in range(1, min(map(len, words), default=0), 2):
+    places = range(1, min(map(len, words), default=0), 2)
+    for k in places:
         kinds = sorted({split[k] for split in words}, key=natural)
+        repeated = [j for j in places if len(kinds) == 2 and all(split[j] == split[k] for split in words)]
+        if repeated[:1] != [k]:
+            continue
         parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
-        rest = [{tuple(words[i][:k] + words[i][k + 1 :]) for i in of} for of in parts.values()]
-        if len(kinds) == 2 and rest[0] == rest[1] and len(rest[0]) > 1:
+        rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
+        if rest[0] == rest[1] and len(rest[0]) > 1:
             found.append(parts)
     return found[0] if len(found) == 1 else {}
 
@@ -295,7 +310,8 @@ def pair_up(
     if alone:
         more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
         text = f"{alone[0]} has no partner by {rule}{more}; {both}"
-        remedy = "add the missing image, narrow the patterns, or choose another images.pair"
+        order = 'state images.pair = "order" if they belong together in order of their names; else '
+        remedy = f"{order if len(left) == len(right) else ''}add the missing image, or narrow the patterns"
         raise IncompleteError("RIL-259", text, remedy=remedy)
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
 
@@ -307,10 +323,12 @@ def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, s
         return "order"
     if len({path.name for path in left}) == len({path.name for path in right}) == 1:
         return "folder"
-    shared = {names[path] for path in left} & {names[path] for path in right}
+    ours, theirs = ({names[path] for path in of} for of in (left, right))
+    shared = ours & theirs
     if joined is not None and (joined.apart or not shared):
-        return "nearest"
-    return "name" if shared else "number"
+        return "order" if joined.two_clocks else "nearest"
+    # Where as many images share few names (of seconds that tick between), numbers tell more.
+    return "name" if shared and (2 * len(shared) > len(ours | theirs) or len(ours) != len(theirs)) else "number"
 
 
 def _sorted(paths: Sequence[Path], names: Mapping[Path, str]) -> list[Path]:

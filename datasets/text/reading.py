@@ -84,7 +84,8 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
         text = f"{what} {path} cannot be read: {missing_target(path) or reason}"
-        raise InputError("RIL-138", text, remedy="check the path and its rights") from error
+        remedy = "name a file in it" if os.path.isdir(path) else "check the path and its rights"
+        raise InputError("RIL-138", text, remedy=remedy) from error
     if status.st_size <= most:
         text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
         raise InputError("RIL-820", text, remedy="fetch it: git lfs pull, or git annex get")

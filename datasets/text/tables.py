@@ -145,7 +145,7 @@ def read_table(path: Path, what: str) -> TextTable:
             separator = next((s for s in ",;" if s in text), None)
             columns = len(split(names, separator or ("\t" if "\t" in names else None)))
         row = split(text, separator, columns)
-        if not rows and not NUMBER.match(row[0]):
+        if not rows and not NUMBER.match(row[0]) and not _named(row, columns):
             text = text.lstrip("#%").strip()
             cells = split(text, separator, columns)
             below = names and len(cells) == len(split(names, separator, columns))
@@ -167,6 +167,11 @@ def read_table(path: Path, what: str) -> TextTable:
     if len(units) == columns:
         header = tuple(f"{n} [{u.strip('[]()')}]" if u else n for n, u in zip(header, units, strict=False))
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
+
+
+def _named(row: tuple[str, ...], columns: int) -> bool:
+    """Whether numbers follow a name, as that of a vehicle or of an image, in as many cells as there are names."""
+    return len(row) == columns and row[0][:1].isalpha() and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
 
 
 def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:

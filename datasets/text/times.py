@@ -23,8 +23,8 @@ UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Largest value in each unit: 1e11 s after 1970 is the year 5138."""
 
 DATE = re.compile(
-    r"(?<!\d)((?:19|20)\d\d([-_/]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
-    r"(?:\.(\d+)|[-_]?(\d{3}))?(Z|\+\d\d:?\d\d|-\d\d:\d\d| [-+]\d\d:?\d\d)?(?!\d)"
+    r"(?<!\d)((?:19|20)\d\d([-_/:]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
+    r"(?:\.(\d+)|[-_]?(\d{3}|\d{6}))?(Z|\+\d\d:?\d\d|-\d\d:\d\d| [-+]\d\d:?\d\d)?(?!\d)"
 )
 """Date and time of day, with a fraction or milliseconds and a zone, as in logs and names of files."""
 

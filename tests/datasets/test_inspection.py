@@ -54,6 +54,10 @@ def both(template: str, names: list[str]) -> list[str]:
     return [template.format(side=side, name=name) for name in names for side in ("left", "right")]
 
 
+CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
+LCAM = "image_lcam/*.png", "image_rcam/*.png"
+
+
 @pytest.mark.parametrize(
     ("files", "left", "right", "pairs"),
     [
@@ -74,6 +78,11 @@ def both(template: str, names: list[str]) -> list[str]:
         (both("a/{name}/{side}/x.png", ["9", "10"]), "a/*/left/x.png", "a/*/right/x.png", 2),
         ([f"{k:03d}/v_{c}.png" for k in range(3) for c in (3, 4)], "*/v_3.png", "*/v_4.png", 3),
         (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
+        ([f"{c}/{k}.png" for c in ("rgb_left", "mono_right") for k in (1, 2)], "rgb_left/*.png", "mono_right/*.png", 2),
+        ([f"{c}/{k}.png" for c in "右左" for k in (1, 2)], "左/*.png", "右/*.png", 2),
+        ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
+        ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
+        ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
     ],
 )
 def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
@@ -106,12 +115,14 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
     [
         ("A/{}.png", "B/{}.png", ("A/*.png", "B/*.png")),
         ("cam1/{}.png", "cam2/{}.png", ("cam1/*.png", "cam2/*.png")),
+        ("cam1/cam1_{}.png", "cam2/cam2_{}.png", ("cam1/cam1_*.png", "cam2/cam2_*.png")),
+        ("A/image_{}.png", "B/image_{}.png", ("A/image_*.png", "B/image_*.png")),
         ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
         ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
     ],
 )
 def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, left, right, patterns):
-    write_images(tmp_path, [name.format(k) for k in (1, 2, 3) for name in (left, right)])
+    write_images(tmp_path, [name.format(k) for k in (0, 1, 2) for name in (left, right)])
     (tmp_path / "rig.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0))
     found = inspect(tmp_path)
     assert (found.views.pairs, found.views.trouble) == (3, "")
@@ -153,6 +164,17 @@ def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path, ["1.png", "2.png"])
     with raises("RIL-194", "2 images, 0 named as left and 0 as right"):
         inspect(tmp_path)
+    write_images(tmp_path / "high", ["1.png"], (48, 64))
+    with raises("RIL-194", "one above the other, crop=iw:ih/2"):
+        inspect(tmp_path / "high")
+    (tmp_path / "videos" / "a" / "b" / "c" / "d" / "e").mkdir(parents=True)
+    with raises("RIL-194", "0 images", "(4 folders deep): name the folder that holds the images"):
+        inspect(tmp_path / "videos")
+    (tmp_path / "videos" / "left.mp4").touch()
+    with raises("RIL-194", "(4 folders deep): 1 video (left.mp4): take its images out"):
+        inspect(tmp_path / "videos")
+    write_images(tmp_path / "one", [f"image_{k}.png" for k in range(4)])
+    assert "'image_0' and 'image_1' are taken for two cameras" in inspect(tmp_path / "one").views.lines[0]
     with raises("RIL-193"):
         inspect(tmp_path / "nothing")
     with raises("RIL-193", "ZED SDK"):
@@ -186,6 +208,8 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"] * 2, "truth"),
         (["0.1 0.6 0.8 0 9 -0.8 0.6 0 8 0 0 1 7"] * 2, "truth"),
         (["700 0 30 0 0 700 20 0 0 0 1 0"] * 2, ""),
+        (["5 0 0 0 0 0.6 0.8"] * 2, "truth"),
+        (["5 0 0 0 0 0.6 0.8"] * 3, ""),
         (["t,ax,ay,az,gx,gy,gz", "140,0,0,9.8,0.1,-3.6,0"], "imu"),
         (["# time x y z qx qy qz qw", "0.1 0 0 0 0 0 0.6 0.8"], "truth"),
         (["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z", "1403,0.9,2.2,0.9,0.8,0.6,0.0,0.0,0.1,0.2"], "truth"),
@@ -247,6 +271,19 @@ def test_what_is_recognised_and_refused_is_told(tmp_path):
     assert all("decimal commas" in found.unread[k] for k in (0, 2))
 
 
+def test_texts_that_seem_to_describe_cameras_are_told_once_with_what_to_write_instead(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]))
+    write_lines(tmp_path / "calib_0.txt", ["Pinhole 1 2 3 4 0"])
+    write_lines(tmp_path / "transforms.json", ['{"fl_x": 460.0}'])
+    write_lines(tmp_path / "notes.txt", ["dusty"])
+    found = inspect(tmp_path)
+    assert [line.partition(":")[0] for line in found.unread] == [
+        "2 calibrations (calib_0.txt and 1 more)",
+        "1 file (notes.txt)",
+    ]
+    assert "of another program write fx, fy, cx, cy and baseline" in found.unread[0]
+
+
 def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "2"]), (960, 600))
     section = "[{side}_CAM_{name}]\nfx={f}\nfy={f}\ncx={f}\ncy={f}\n"
@@ -306,6 +343,31 @@ def test_calibration_of_both_cameras_is_preferred(tmp_path):
     assert calibration is not None
     assert calibration.files == ("rig.yaml",)
     assert calibration.baseline == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("image", "calibration"), [("{k}/im{c}.png", "{k}/calib.yaml"), ("im{c}/{k}.png", "calib/00{k}.yaml")]
+)
+def test_calibrations_of_each_pair_that_differ_are_told(tmp_path, image, calibration):
+    write_images(tmp_path, [image.format(k=k, c=c) for k in range(3) for c in (0, 1)])
+    for k, bf in enumerate((6.0, 6.0, 7.0)):
+        path = tmp_path / calibration.format(k=k)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(ORB_SETTINGS.format(*SIZE, bf=bf))
+    (line,) = inspect(tmp_path).unread
+    assert line.startswith(f"1 calibration ({calibration.format(k=2)}): unlike {calibration.format(k=0)}")
+
+
+def test_of_several_scenes_one_is_taken_with_its_own_calibration(tmp_path):
+    scenes = ("delivery", "forest", "playground")
+    write_images(tmp_path, [f"{scene}/im{c}.png" for scene in scenes for c in (0, 1)])
+    for scene in scenes:
+        (tmp_path / scene / "calib.yaml").write_text(ORB_SETTINGS.format(*SIZE, bf=6.0 + len(scene)))
+    found = inspect(tmp_path)
+    assert found.views.left == "forest/im0.png"
+    assert found.calibration is not None
+    assert found.calibration.files == ("forest/calib.yaml",)
+    assert "calib" not in " ".join(found.unread)
 
 
 def test_both_files_of_opencvs_sample_are_read(tmp_path):
@@ -630,6 +692,12 @@ def test_images_that_may_show_both_views_say_how_they_are_split(tmp_path, place)
     write_images(tmp_path / "wide", [f"{place}1.png", f"{place}2.png"], (128, 48))
     with raises("RIL-194", "if each shows both views: mkdir left right; ffmpeg"):
         inspect(tmp_path / "wide")
+    (tmp_path / "videos" / "a" / "b" / "c" / "d" / "e").mkdir(parents=True)
+    with raises("RIL-194", "0 images", "(4 folders deep): name the folder that holds the images"):
+        inspect(tmp_path / "videos")
+    (tmp_path / "videos" / "left.mp4").touch()
+    with raises("RIL-194", "(4 folders deep): 1 video (left.mp4): take its images out"):
+        inspect(tmp_path / "videos")
     write_images(tmp_path / "one", ["1.png"])
     with pytest.raises(InputError) as caught:
         inspect(tmp_path / "one")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import cv2
@@ -298,6 +299,33 @@ def test_stamps_of_two_clocks_are_said():
     jitter = stamped("{ns}.png", [20, 115, 230])  # no frame apart, though too far for "nearest"
     assert len(pair_up(left, jitter, "order", warnings=lines)) == 3
     assert "0.02 s later" in lines[1]
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%dT%H-%M-%S.%fZ", "%Y%m%d_%H%M%S_%f", "IMG_%Y:%m:%d_%H:%M:%S.%f"])
+@pytest.mark.parametrize("later", [0.003, 0.02])
+def test_dates_apart_by_a_constant_are_pairs(form, later):
+    """3 ms are within the tolerance, 20 of 100 ms are two clocks, which is said."""
+    start = datetime(2024, 5, 1, 12, tzinfo=UTC)
+    moments = [[start + timedelta(seconds=k / 10 + shift) for k in range(12)] for shift in (0, later)]
+    left, right = ([Path(f"{side}/{t.strftime(form)}.png") for t in of] for side, of in zip("ab", moments, strict=True))
+    lines: list[str] = []
+    pairs = pair_up(left, right, warnings=lines)
+    assert [(p.left, p.right) for p in pairs] == list(zip(left, right, strict=True))
+    assert ("RIL-824" if later > 0.01 else "RIL-821") in lines[0]
+    with raises("RIL-822"):
+        pair_up(left[:-1], [p.with_name(p.name.replace("2024", "2025")) for p in right])
+
+
+def test_whole_seconds_tell_no_pairs():
+    """The right image of a pair may be written a second later."""
+    names = [(f"l/20231104_1015{k}0_{k}111.png", f"r/20231104_1015{k}{k}_{k}111.png") for k in range(4)]
+    left, right = ([Path(name) for name in of] for of in zip(*names, strict=True))
+    assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
+
+
+def test_a_counter_after_a_date_is_no_time():
+    left, right = ([Path(f"{s}/20231104_101500_{k:06d}{s}.png") for k in range(5, 9)] for s in "xy")
+    assert [(p.left, p.right) for p in pair_up(left, right)] == list(zip(left, right, strict=True))
 
 
 def test_a_date_that_all_names_share_is_no_time_stamp():

@@ -72,6 +72,19 @@ def test_the_order_of_quaternions_without_names_between_commas_is_not_guessed(tm
     assert read(tmp_path, f"1403715273262142976,1,2,3,{H},0,0,{H}\n").poses[0].rotation[1, 0] == pytest.approx(1.0)
 
 
+def test_poses_without_times_are_one_a_frame(tmp_path):
+    """As TartanAir has them."""
+    for row, kwargs in ((f"1 2 3 0 0 {H} {H}\n", {}), (f"1,2,3,{H},0,0,{H}\n", {"format": "euroc"})):
+        found = read(tmp_path, row * 2, **kwargs)
+        assert (found.times, len(found.poses)) == (None, 2)
+        np.testing.assert_allclose(found.poses[0].matrix34, np.c_[TURN, [1, 2, 3]], atol=1e-6)
+        assert positions_of(read_motion(tmp_path / "poses.txt"), "auto", {}) is None
+    with raises("RIL-745"):
+        read(tmp_path, f"1,2,3,{H},0,0,{H}\n")
+    with raises("RIL-264", "7 numbers"):
+        read(tmp_path, "1 2 3 0 0 7 7\n")
+
+
 def test_poses_of_a_message_as_tools_of_ros_write_it(tmp_path):
     names = [
         f"field.pose.pose.{part}.{axis}" for part, of in (("position", "xyz"), ("orientation", "xyzw")) for axis in of

@@ -43,6 +43,7 @@ def test_pipes_devices_and_folders_are_never_opened(tmp_path):
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero", "."):
         refused("RIL-138", read_bytes, tmp_path / name, "table", 10)
+    assert "name a file in it" in refused("RIL-138", read_bytes, tmp_path, "table", 10)
     refused("RIL-138", read_bytes, tmp_path / "none", "table", 10)
     refused("RIL-138", read_bytes, tmp_path / "zero\0byte", "table", 10)
 

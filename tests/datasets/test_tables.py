@@ -67,6 +67,15 @@ def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
     assert table(tmp_path, "# recorded in the yard\n1 2 3\n").header == ()
 
 
+def test_a_name_may_stand_first_in_a_row(tmp_path):
+    """As AirSim's recording has it."""
+    of_airsim = table(
+        tmp_path, "VehicleName\tTimeStamp\tPOS_X\tImageFile\tQ\nDrone 1\t5\t1\ta.png\t2\nDrone 1\t6\t2\tb.png\t2\n"
+    )
+    assert of_airsim.header[1:3] == ("timestamp", "pos_x")
+    assert of_airsim.values([1, 2]).tolist() == [[5, 1], [6, 2]]
+
+
 def test_names_in_brackets_are_no_json(tmp_path):
     assert table(tmp_path, "[s] [m]\n1 2\n").header == ("[s]", "[m]")
 

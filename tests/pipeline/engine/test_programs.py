@@ -222,6 +222,14 @@ def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_p
     exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": workers.check})  # no worker imports it
 
 
+def test_a_program_from_standard_input_has_no_file_that_workers_would_read(monkeypatch):
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<stdin>")
+    workers.check("inline")
+    assert sys.modules["__main__"].__file__ == "<stdin>"
+    workers.check("dask")
+    assert not hasattr(sys.modules["__main__"], "__file__")
+
+
 def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):
     """No worker imports its ``__main__``."""
     (tmp_path / "package").mkdir()
