@@ -174,7 +174,8 @@ def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, name):
     assert abs(off) * CAMERA.fx < 0.15
     assert "contradiction" not in facts  # all that rests on it is computed anew
     assert f"{np.degrees(before):+.3f}" in facts["warnings"][0]
-    assert facts["warnings"][0].endswith(f"degrees ({name}); corrected")
+    assert f"degrees ({name})" in facts["warnings"][0]
+    assert facts["warnings"][0].endswith("; corrected")
     assert ("yaw" if name == "pitch" else "pitch") in facts["errors"]
 
 
@@ -184,14 +185,25 @@ def test_a_yaw_is_kept_where_the_rig_is_fixed():
     assert "kept because rig.mode = fixed" in facts["contradiction"]
 
 
-@pytest.mark.parametrize("time", [0.9, 0.5, -0.6, 0.0])
+@pytest.mark.parametrize("time", [0.9, 0.5, -0.6, 0.0, 2.5])
 def test_rows_of_unlike_times_are_named_and_no_rig_is_repaired(time):
+    """No row is read later than the next image."""
     facts = facts_from([read_row_by_row(seed, time) for seed in range(5)])
-    assert not any(facts["correction"])
-    assert ("rolling shutter" in facts.get("contradiction", "")) == bool(time)
-    assert [line for line in facts["warnings"] if "rolling shutter" not in line] == []
-    if time:
+    assert time > 1.0 or not any(facts["correction"])
+    assert ("rolling shutter" in facts.get("contradiction", "")) == (0.0 < abs(time) < 1.0)
+    assert time > 1.0 or [line for line in facts["warnings"] if "rolling shutter" not in line] == []
+    if 0.0 < abs(time) < 1.0:
         assert float(facts["contradiction"].split("ask for ")[1].split()[0]) == pytest.approx(time, rel=0.3)
+
+
+@pytest.mark.parametrize(("step", "segments"), [(0.001, 5), (-0.0003, 8), (0.0, 5), (0.003, 3)])
+def test_a_rig_that_bends_along_the_way_is_named(step, segments):
+    parts = [segment(k, CAMERA, Lens(CAMERA), 0.0, step * (k - segments // 2)) for k in range(segments)]
+    doubt = facts_from(parts).get("contradiction", "")
+    assert ("the rig bends" in doubt) == (step != 0.0 and segments > 3)
+    if doubt:
+        change = float(doubt.split("turns by ")[1].split()[0])
+        assert change == pytest.approx(np.degrees(-step * (segments - 1)), rel=0.2)
 
 
 def test_a_yaw_below_half_a_pixel_passes():
