@@ -122,7 +122,7 @@ LIMITS = {
             least=0.02,
             remedy="do both images show one scene, taken at one time, sharp, and neither mirrored?",
         ),
-        InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, or little overlap of left and right"),
+        InputLimit("RIL-657", "matched", least=0.3, remedy="little texture, little overlap, or strong compression"),
         InputLimit("RIL-658", "baselines away", most=200, remedy="depth is a guess there; is the baseline right?"),
     ),
     "sides": (
@@ -142,7 +142,12 @@ LIMITS = {
     "epipolar": (
         InputLimit("RIL-661", "known", least=1, remedy="see the matching"),
         Fault("RIL-673", "turned, degrees", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
-        Fault("RIL-662", "adjusted, px", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
+        Fault(
+            "RIL-662",
+            "adjusted, px",
+            most=5.0,
+            remedy="wrong calibration file, transforms inverted (T_BS), or lens distortion left in",
+        ),
         InputLimit("RIL-663", "adjusted, px", most=1.0, remedy="is lens distortion left in, or the wrong file given?"),
         InputLimit(
             "RIL-664",
