@@ -37,7 +37,7 @@ from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
 from rille.stages.geometry import epipolar, rigid
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
-from rille.stages.numeric.robust import huber_weight
+from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentAdjustment,
     SegmentNormal,
@@ -82,6 +82,9 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 """The same two limits of the yaw, as pixels of disparity; rows pass up to as many
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
+
+MAX_BIAS_SCATTER = 0.2
+"""Scatter over their size up to which segments agree on an error of all disparities."""
 
 MIN_READ_OUT, MAX_READ_OUT = 0.3, 1.2
 """Time from the first to the last row, in intervals between frames, from which on a rolling shutter is named: of global
@@ -298,6 +301,31 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         wrong[departure.argmax()] = True
 
 
+def px_per_yaw(rig: Rig) -> float:
+    """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it."""
+    far = np.array([[0.0, 0.0, 100.0 * rig.baseline]])
+    left, right = rig.left.project(far), rig.right.project(rig.T_right_left.apply(far))
+    before, after = (
+        triangulated(left, right, one, RigidTransform.identity(), np.ones(1))
+        for one in (rig, corrected_rig(rig, np.zeros(CORRECTED), STEP))
+    )
+    along = (after.position - before.position) * before.per_pixel
+    return float(along.sum() / (before.per_pixel**2).sum()) / STEP
+
+
+def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
+    """Yaw of a rig, rad, that most segments agree on whose first frame has no pose because of it; 0: there is none.
+
+    Where the camera drives straight on, a zoom of one frame looks the same: so no pose is given with the yaw, before it
+    is corrected.
+    """
+    biases = [one["bias_px"] for s in segments for one in s.meta["per_frame"][1:2] if "bias_px" in one]
+    if len(biases) < max(MIN_YAW_SEGMENTS, len(segments) / 2):
+        return 0.0
+    usual = float(np.median(biases))
+    return usual / px_per_yaw(rig) if mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual) else 0.0
+
+
 def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
     """One line on the numbers of the cameras that were corrected; empty if none was.
 
@@ -410,6 +438,8 @@ def intrinsics_stage(
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
     late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
+    if not fixed:
+        turn = turn or hidden_yaw(segments, given)
     sigma = np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:
