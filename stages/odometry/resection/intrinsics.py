@@ -323,7 +323,8 @@ def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
     if len(biases) < max(MIN_YAW_SEGMENTS, len(segments) / 2):
         return 0.0
     usual = float(np.median(biases))
-    return usual / px_per_yaw(rig) if mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual) else 0.0
+    agreed = abs(usual) > MIN_YAW_PX and mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual)
+    return usual / px_per_yaw(rig) if agreed else 0.0
 
 
 def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
