@@ -110,7 +110,7 @@ LIMITS = (
         least=0.02,
         remedy="do both images show one scene, taken at one time, sharp, and neither mirrored?",
     ),
-    Limit("RIL-657", "matched", "matching", least=0.3, remedy="little texture, or little overlap of left and right"),
+    Limit("RIL-657", "matched", "matching", least=0.3, remedy="little texture, little overlap, or strong compression"),
     Limit("RIL-658", "baselines away", "matching", most=200, remedy="depth is a guess there; is the baseline right?"),
     Fault(
         "RIL-659",
@@ -127,7 +127,13 @@ LIMITS = (
     Limit("RIL-679", "above", "ground", most=0),
     Limit("RIL-661", "known", "epipolar", least=1, remedy="see the matching"),
     Fault("RIL-673", "turned, degrees", "epipolar", most=MAX_IMAGE_TURN_DEG, remedy="turn one camera's images back"),
-    Fault("RIL-662", "adjusted, px", "epipolar", most=5.0, remedy="wrong calibration file, or lens distortion left in"),
+    Fault(
+        "RIL-662",
+        "adjusted, px",
+        "epipolar",
+        most=5.0,
+        remedy="wrong calibration file, transforms inverted (T_BS), or lens distortion left in",
+    ),
     Limit(
         "RIL-663", "adjusted, px", "epipolar", most=1.0, remedy="is lens distortion left in, or the wrong file given?"
     ),

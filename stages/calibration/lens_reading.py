@@ -22,8 +22,9 @@ from rille.stages.geometry.lens import Lens
 
 TRANSPOSED = "it is transposed"
 EXCHANGED = "those of left and right are exchanged"
-MAX_RATIO = 1.25
-"""Ratio of a focal length to the given one up to which it is searched for; beyond it images hardly match."""
+MIN_RATIO, MAX_RATIO = 1.005, 1.25
+"""Ratios of a focal length to the given one between which it is misread: less is the error of a usual calibration;
+beyond, images hardly match."""
 
 
 def readings(lens: Lens) -> dict[str, Lens]:
@@ -81,7 +82,7 @@ def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: S
     )
     ratio, fitted = float(found.x), float(found.fun)
     focal = f"the right camera's is {ratio:.3f} times as given, or the left one's {1 / ratio:.3f} times"
-    if fitted <= 0.5 * min(spread(1.0), off(lenses, repaired)):
+    if max(ratio, 1.0 / ratio) > MIN_RATIO and fitted <= 0.5 * min(spread(1.0), off(lenses, repaired)):
         both[focal] = fitted
     name, least = min(both.items(), key=lambda item: item[1])
     # Half of it: by chance no reading is so much better.

@@ -247,9 +247,14 @@ class _Chooser:
         return any(k != i for k in chosen if k < ANGLES)
 
     def _infinity(self, i: int, chosen: list[int]) -> bool:
-        """Whether many matches lie beyond infinity, and this parameter explains them."""
+        """Whether many matches lie beyond infinity, and this parameter explains them, and half of it does not.
+
+        Rows that hardly show a toe-in may ask for several times as much as brings all matches before infinity.
+        """
         x, _, _ = self._solve([*chosen, i], rival=False)
-        return self._explains(np.where(np.isin(np.arange(RIG), [*chosen, i]), x[:RIG], 0.0))
+        whole = np.where(np.isin(np.arange(RIG), [*chosen, i]), x[:RIG], 0.0)
+        half = np.where(np.arange(RIG) == i, 0.5, 1.0) * whole
+        return self._explains(whole) and not self._explains(half)
 
     def _asked(self, i: int, chosen: list[int]) -> _Estimate:
         x, covariance, _ = self._solve([*chosen, i], rival=False)

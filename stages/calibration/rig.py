@@ -266,7 +266,7 @@ def _doubts(share: float, residual: float, bad_rows: float) -> list[str]:
     if residual > bad_rows:
         lines.append(
             f"matches lie {residual:.1f} px RMS off their epipolar lines: is lens distortion left in the images, or "
-            "the wrong calibration given?"
+            "the wrong calibration given, or are its transforms inverted (T_BS leads from the camera to the body)?"
         )
     if share > BEYOND_SHARE:
         lines.append(f"{100 * share:.0f} % of the matches lie beyond infinity: the toe-in is wrong")

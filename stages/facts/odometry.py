@@ -63,7 +63,8 @@ class TrackFacts(Facts):
 class ResectFacts(Facts):
     """Poses of a segment's frames.
 
-    ``per_frame``: frame, landmarks, inliers, rms_px of each, and why it is ``lost``. ``intrinsics``: what the segment,
+    ``per_frame``: frame, landmarks, inliers, rms_px of each, why it is ``lost``, and ``bias_px``, an error of all
+    disparities with which it has a pose. ``intrinsics``: what the segment,
     adjusted jointly, says of errors of the calibration (``information``, ``pull``, ``turn_deg``; ``yaw`` and
     ``read_out``: information and pull of the rig's, and of the time that passes between the first and the last row),
     and the ``bias_px`` of its disparities; empty where nothing was adjusted.

@@ -201,12 +201,15 @@ def _leading(out: Judgement, chain: list[int]) -> None:
         out.lost[f] = f"{out.unfit[f]}, and no good pair before it"
 
 
-def _jumps(frames: Sequence[int], changes: Sequence[float], params: FrameScreeningParams) -> list[int]:
-    """Frames at the abrupt changes; ``changes`` has one value a frame but the first and the last."""
+def _jumps(frames: Sequence[int], along: Sequence[Step], params: FrameScreeningParams) -> list[int]:
+    """Frames at the abrupt changes of the steps ``along`` the frames."""
+    changes = [a.change(b) for a, b in pairwise(along)]
     if not changes:
         return []
-    # A quarter is usual: one exchanged frame changes three steps, half of a short sequence.
-    limit = max(params.jump, params.jump * float(np.quantile(changes, 0.25, method="lower")))
+    # A quarter is usual: one exchanged frame changes three steps, half of a short sequence. If the motion changes by
+    # half of itself throughout, every other frame may be exchanged.
+    usual = params.jump * float(np.quantile(changes, 0.25, method="lower"))
+    limit = max(params.jump, min(usual, 0.5 * float(np.median([step.displacement or 0.0 for step in along]))))
     found = {n for k, value in enumerate(changes) if value > limit for n in frames[k : k + 3]}
     return [f for f in frames if f in found]
 
@@ -227,9 +230,8 @@ def frame_screening_stage(
     seen: dict[int, Mapping[str, Any]] = {f: s.meta for f, s in zip(frames, qualities, strict=True)}
     shares = {s: step.match_rate for s, step in zip(pairwise(frames), along, strict=True)}
     shares |= {(a, b): Step.from_bundle(m).match_rate for (a, b), m in zip(bridged, bridges, strict=True)}
-    changes = [a.change(b) for a, b in pairwise(along)]
     tested = {s.meta["frame"]: s.meta for s in sides}
-    found = judge(list(frames), seen, shares, _jumps(list(frames), changes, params), tested, params)
+    found = judge(list(frames), seen, shares, _jumps(list(frames), along, params), tested, params)
     chain = [f for f in frames if f not in found.lost]
     unfit = {f: why for f, why in found.unfit.items() if f in chain}
     meta: ScreeningFacts = {

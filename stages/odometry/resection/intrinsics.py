@@ -12,7 +12,8 @@ drive shows that as well, so all segments count for it, each by its own common e
 other, pitch takes its place.
 
 A rolling shutter reads the rows one after the other: a point that wanders down the image moved for longer than one that
-does not. That looks like a wrong rig, which is then left as it is, and named.
+does not. That looks like a wrong rig, which is then left as it is, and named. So is a rig that bends, whose yaw changes
+along the way.
 
 A number that the tracks contradict is corrected, and images, rig, segments and maps are computed anew with the
 corrected calibration. An error that does not contradict its prior is part of the covariance alone. The length of the
@@ -36,7 +37,7 @@ from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
 from rille.stages.geometry import epipolar, rigid
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
-from rille.stages.numeric.robust import huber_weight
+from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentAdjustment,
     SegmentNormal,
@@ -82,9 +83,13 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
 
-MIN_READ_OUT = 0.3
+MAX_BIAS_SCATTER = 0.2
+"""Scatter over their size up to which segments agree on an error of all disparities."""
+
+MIN_READ_OUT, MAX_READ_OUT = 0.3, 1.2
 """Time from the first to the last row, in intervals between frames, from which on a rolling shutter is named: of global
-shutters the tracks ask for 0.05 at most, and for 0.25 where the focal length is off by 8 %."""
+shutters the tracks ask for 0.05 at most, and for 0.25 where the focal length is off by 8 %. An image is
+read before the next one is: beyond an interval the tracks show something else, as of a plane straight ahead."""
 
 
 class IntrinsicsParams(Params):
@@ -296,6 +301,32 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         wrong[departure.argmax()] = True
 
 
+def px_per_yaw(rig: Rig) -> float:
+    """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it."""
+    far = np.array([[0.0, 0.0, 100.0 * rig.baseline]])
+    left, right = rig.left.project(far), rig.right.project(rig.T_right_left.apply(far))
+    before, after = (
+        triangulated(left, right, one, RigidTransform.identity(), np.ones(1))
+        for one in (rig, corrected_rig(rig, np.zeros(CORRECTED), STEP))
+    )
+    along = (after.position - before.position) * before.per_pixel
+    return float(along.sum() / (before.per_pixel**2).sum()) / STEP
+
+
+def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
+    """Yaw of a rig, rad, that most segments agree on whose first frame has no pose because of it; 0: there is none.
+
+    Where the camera drives straight on, a zoom of one frame looks the same: so no pose is given with the yaw, before it
+    is corrected.
+    """
+    biases = [one["bias_px"] for s in segments for one in s.meta["per_frame"][1:2] if "bias_px" in one]
+    if len(biases) < max(MIN_YAW_SEGMENTS, len(segments) / 2):
+        return 0.0
+    usual = float(np.median(biases))
+    agreed = abs(usual) > MIN_YAW_PX and mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual)
+    return usual / px_per_yaw(rig) if agreed else 0.0
+
+
 def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
     """One line on the numbers of the cameras that were corrected; empty if none was.
 
@@ -327,7 +358,8 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
     outcome = "kept because rig.mode = fixed: depths and lengths are off by that" if fixed else "corrected"
     return (
         "the tracks contradict the rig: near and far landmarks ask for different motions, unless the right camera is "
-        f"turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees ({name}); {outcome}"
+        f"turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees ({name}), or the focus of both "
+        f"creeps; {outcome}"
     )
 
 
@@ -339,6 +371,17 @@ def read_out_contradiction(time: float, sigma: float) -> str:
         "rows of an image are not of one time (rolling shutter), or lights move along with the cameras: the tracks ask "
         f"for {time:+.2f} +- {sigma:.2f} intervals between frames from the first row to the last; path and elevations "
         "are distorted, and the rig's yaw is not corrected: use global shutters, or stand while images are taken"
+    )
+
+
+def bend_contradiction(angle: float, sigma: float, name: str) -> str:
+    """One line on the change of the rig's yaw (``name``), rad, from the first segment to the last; empty if it is 0."""
+    if not angle:
+        return ""
+    return (
+        "the rig bends along the way: near and far landmarks ask for a right camera that turns by "
+        f"{math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees ({name}) from the first segment to the last; "
+        "elevations are off by that: mount both cameras on one stiff bar, and let them warm up before"
     )
 
 
@@ -379,18 +422,26 @@ def intrinsics_stage(
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
 
-    def alone(name: str, least: float) -> tuple[CommonErrors, float]:
-        """Estimate of one number alone, and its value if enough segments agree that it is not 0."""
-        shown = np.array([part[name] for part in parts]).reshape(-1, 2, 1)
+    def alone(name: str, least: float, *, change: bool = False) -> tuple[CommonErrors, float]:
+        """Estimate of one number alone, and its value, if enough segments agree that it is not 0; or the estimate of
+        this number and of its ``change`` from the first segment to the last, and that change."""
+        shown = np.array([part[name] for part in parts]).reshape(-1, 2)
+        by = np.vander(np.linspace(-0.5, 0.5, len(parts)), 1 + change, increasing=True)
         # Any is as likely: drawn to 0 by a prior, few segments that agree would seem to contradict each other.
-        found = common_errors(shown[:, :1], shown[:, 1], np.array([math.pi]), least)
-        return found, float(found.errors[0]) if found.wrong[0] and len(parts) >= MIN_YAW_SEGMENTS else 0.0
+        free = np.full(1 + change, math.pi)
+        found = common_errors(shown[:, :1, None] * by[:, :, None] * by[:, None], shown[:, 1:] * by, free, least)
+        enough = found.wrong[-1] and len(parts) >= MIN_YAW_SEGMENTS * len(free)
+        return found, float(found.errors[-1]) if enough else 0.0
 
     yaw, turn = alone("yaw", (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal)
+    bend, bent = alone("yaw", MIN_YAW_PX / focal, change=True)
     read_out, late = alone("read_out", MIN_READ_OUT)
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
-    late = 0.0 if common.wrong.any() else late
-    turn, sigma = 0.0 if late else turn, np.sqrt(np.diag(common.covariance))
+    late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
+    turn, bent = (0.0 if late else angle for angle in (turn, bent))
+    if not fixed:
+        turn = turn or hidden_yaw(segments, given)
+    sigma = np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
     if turn and not fixed:
         correction = np.array([*np.zeros(CORRECTED), turn])
@@ -408,10 +459,12 @@ def intrinsics_stage(
         facts["inverse_depth_std"] = inverse_depth_std(facts["yaw"], given.baseline)
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
-    angle = yaw_contradiction(off, facts["yaw"][1], epipolar.angle_along(given), fixed=fixed)
+    name = epipolar.angle_along(given)
+    angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed)
+    bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name)
     rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0]))
-    if doubt := "; ".join(filter(None, [rows, cameras, angle if fixed else ""])):
+    if doubt := "; ".join(filter(None, [rows, bends, cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.
-    facts["warnings"] = [] if correction.any() else [line for line in (rows, angle, cameras) if line]
+    facts["warnings"] = [] if correction.any() else [line for line in (rows, bends, angle, cameras) if line]
     return Bundle({}, facts)

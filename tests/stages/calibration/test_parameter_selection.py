@@ -68,19 +68,32 @@ def test_an_angle_that_departs_alone_is_likelier_a_principal_point_and_with_othe
     assert freed(both) == {"yaw", "roll"}
 
 
+def far(rays, rng):
+    """A plain to the horizon, half the image beyond 100 m."""
+    return np.where(rays[:, 1] > 0.05, 1.65 / np.maximum(rays[:, 1], 0.05), rng.uniform(100, 1000, len(rays)))
+
+
 def test_matches_beyond_infinity_show_a_wrong_toe_in():
     """Depth is surely wrong, and the keystone of the rows says by how much."""
     rig = street_rig()
-
-    def far(rays, rng):  # a plain to the horizon, half the image beyond 100 m
-        return np.where(rays[:, 1] > 0.05, 1.65 / np.maximum(rays[:, 1], 0.05), rng.uniform(100, 1000, len(rays)))
-
     pairs = [matches(knocked(rig, yaw_deg=0.8), far, pair=k) for k in range(3)]
     decision = decide(rig, pairs, PARAMS)
     assert freed(decision) == {"yaw"}
     assert found(decision)["yaw"] == pytest.approx(0.8, abs=0.06)
     # turned the other way nothing is impossible, only nearer
     assert not decide(rig, [matches(knocked(rig, yaw_deg=-0.8), far)], PARAMS).changed
+
+
+def test_rows_that_ask_for_four_times_as_much_as_infinity_change_no_toe_in():
+    """As found on KITTI: half of what they ask for brings all matches before infinity, so it is not what was turned."""
+    rig = street_rig()
+    pairs = [matches(knocked(rig, yaw_deg=0.8), far, pair=k) for k in range(3)]
+    for m in pairs:
+        keystone, _ = distances(knocked(rig, yaw_deg=2.4), np.zeros(5), m.left, m.right)
+        m.right[:, 1] -= keystone
+    decision = decide(rig, pairs, PARAMS)
+    assert not decision.changed
+    assert math.degrees(decision.parameters[1].asked) > 2.0
 
 
 def test_noise_that_matches_in_a_sky_makes_no_change_worth_it():

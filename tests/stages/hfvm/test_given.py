@@ -176,15 +176,28 @@ def test_a_map_that_fits_otherwise_is_named_with_how(wrong, fit):
     assert better_reading(left, right, wrong(u)) == fit
 
 
-@pytest.mark.parametrize(("factor", "said"), [(1, []), (16, ["their values times 0.0625"])])
-def test_maps_that_the_images_contradict_are_a_warning(factor, said):
+def warnings_of(images, u):
     usable = np.ones(SHAPE, np.uint8)
-    images = ({"image": image.astype(np.uint8), "valid": usable} for image in scene())
+    images = ({"image": image.astype(np.uint8), "valid": usable} for image in images)
     left, right = (pyramid_stage(PyramidParams(), Bundle(arrays, {})) for arrays in images)
-    lines = hfvm_given_stage(HfvmParams(), left, right, Bundle({"column_disparity": factor * foreign()}, {})).meta
-    lines = lines.get("warnings", [])
+    given = Bundle({"column_disparity": np.asarray(u, np.float32)}, {})
+    return hfvm_given_stage(HfvmParams(), left, right, given).meta.get("warnings", [])
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1, []), (np.nan, []), (16, ["their values times 0.0625"])])
+def test_maps_that_the_images_contradict_are_a_warning(factor, said):
+    lines = warnings_of(scene(), factor * foreign())
     assert len(lines) == len(said)
     assert all(words in line for words, line in zip(said, lines, strict=True))
+
+
+def test_maps_of_the_right_images_are_named():
+    left, x = scene()[0], np.arange(COLS, dtype=np.float64)
+    by = -12.0 - 6.0 * np.sin(x / 9.0)
+    right = np.array([np.interp(x, x + by, row) for row in left])
+    assert warnings_of((left, right), np.tile(by, (ROWS, 1))) == []
+    (line,) = warnings_of((left, right), np.tile(np.interp(x, x + by, by), (ROWS, 1)))
+    assert "are those of the right images" in line
 
 
 def test_absurd_values_count_as_unknown():

@@ -30,7 +30,8 @@ from rille.stages.odometry.resection.intrinsics import (
     intrinsics_stage,
     with_errors,
 )
-from rille.stages.odometry.resection.landmarks import triangulated
+from rille.stages.odometry.resection.landmarks import SegmentPoints, triangulated
+from rille.stages.odometry.resection.resect import resect_segment
 from rille.stages.odometry.resection.robust_pose import ResectParams
 
 CAMERA = Camera(450.0, 450.0, 375.5, 239.5, 752, 480)
@@ -44,11 +45,17 @@ POINTS = 80
 
 
 def segment(
-    seed: int, given: Camera, lens: Lens, turn: float, yaw: float = 0.0, base: RigidTransform = T_RIGHT_LEFT
+    seed: int,
+    given: Camera,
+    lens: Lens,
+    turn: float,
+    yaw: float = 0.0,
+    base: RigidTransform = T_RIGHT_LEFT,
+    ahead: float = 0.0,
 ) -> tuple[SegmentTracks, SegmentState, SegmentCameras]:
     """A camera of 450 px that turns by some ``turn`` radians, and is taken for the given one; true poses.
 
-    The given rig's right camera is turned by ``yaw``, rad.
+    The given rig's right camera is turned by ``yaw``, rad; between frames the camera moves ``ahead``, m, and aside.
     """
     rng = np.random.default_rng(seed)
     rig = calibrated_anew(Rig(given, given, base), [0.0, 0.0, 0.0, yaw])
@@ -60,7 +67,10 @@ def segment(
 
     X = CAMERA.rays(rng.uniform([60, 40], [690, 440], (POINTS, 2))) * rng.uniform(2.0, 8.0, (POINTS, 1))
     moves = [
-        RigidTransform(rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3)) for k in (1, 2)
+        RigidTransform(
+            rotation_exp(turn * rng.standard_normal(3) * k), 0.1 * rng.standard_normal(3) - [0, 0, ahead * k]
+        )
+        for k in (1, 2)
     ]
     landmarks = triangulated(measured(X), measured(base.apply(X)), rig, LEVEL, np.full(POINTS, 0.2))
     pixels = np.array([measured(move.apply(X)) for move in moves])
@@ -116,7 +126,7 @@ def facts_from(segments, turn: float = 0.0, changed: bool = False, **known):
     for tracks, state, cameras in segments:
         end = adjust(tracks, state, PARAMS).state
         part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
-        parts.append(Bundle({}, {"intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}}))
+        parts.append(Bundle({}, {"per_frame": [], "intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}}))
     rig = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": changed})
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
@@ -174,7 +184,8 @@ def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, name):
     assert abs(off) * CAMERA.fx < 0.15
     assert "contradiction" not in facts  # all that rests on it is computed anew
     assert f"{np.degrees(before):+.3f}" in facts["warnings"][0]
-    assert facts["warnings"][0].endswith(f"degrees ({name}); corrected")
+    assert f"degrees ({name})" in facts["warnings"][0]
+    assert facts["warnings"][0].endswith("; corrected")
     assert ("yaw" if name == "pitch" else "pitch") in facts["errors"]
 
 
@@ -184,14 +195,25 @@ def test_a_yaw_is_kept_where_the_rig_is_fixed():
     assert "kept because rig.mode = fixed" in facts["contradiction"]
 
 
-@pytest.mark.parametrize("time", [0.9, 0.5, -0.6, 0.0])
+@pytest.mark.parametrize("time", [0.9, 0.5, -0.6, 0.0, 2.5])
 def test_rows_of_unlike_times_are_named_and_no_rig_is_repaired(time):
+    """No row is read later than the next image."""
     facts = facts_from([read_row_by_row(seed, time) for seed in range(5)])
-    assert not any(facts["correction"])
-    assert ("rolling shutter" in facts.get("contradiction", "")) == bool(time)
-    assert [line for line in facts["warnings"] if "rolling shutter" not in line] == []
-    if time:
+    assert time > 1.0 or not any(facts["correction"])
+    assert ("rolling shutter" in facts.get("contradiction", "")) == (0.0 < abs(time) < 1.0)
+    assert time > 1.0 or [line for line in facts["warnings"] if "rolling shutter" not in line] == []
+    if 0.0 < abs(time) < 1.0:
         assert float(facts["contradiction"].split("ask for ")[1].split()[0]) == pytest.approx(time, rel=0.3)
+
+
+@pytest.mark.parametrize(("step", "segments"), [(0.001, 5), (-0.0003, 8), (0.0, 5), (0.003, 3)])
+def test_a_rig_that_bends_along_the_way_is_named(step, segments):
+    parts = [segment(k, CAMERA, Lens(CAMERA), 0.0, step * (k - segments // 2)) for k in range(segments)]
+    doubt = facts_from(parts).get("contradiction", "")
+    assert ("the rig bends" in doubt) == (step != 0.0 and segments > 3)
+    if doubt:
+        change = float(doubt.split("turns by ")[1].split()[0])
+        assert change == pytest.approx(np.degrees(-step * (segments - 1)), rel=0.2)
 
 
 def test_a_yaw_below_half_a_pixel_passes():
@@ -204,6 +226,24 @@ def test_a_yaw_below_half_a_pixel_passes():
 def test_two_segments_that_agree_tell_a_yaw(segments):
     facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=0.006, segments=segments)
     assert facts["correction"][-1] == pytest.approx(-0.006 * (segments > 1), abs=0.001)
+
+
+@pytest.mark.parametrize("yaw", [0.012, -0.012])
+@pytest.mark.parametrize("refused", [4, 1])
+@pytest.mark.parametrize("centre", [(-0.12, 0.0, 0.0), (0.01, -0.12, 0.0)], ids=["side by side", "one above the other"])
+def test_a_yaw_with_which_no_frame_has_a_pose_is_corrected(yaw, refused, centre):
+    """Where most segments agree on it: one alone may have changed its focal length."""
+    base, parts = RigidTransform(np.eye(3), np.array(centre)), []
+    for seed in range(refused):
+        tracks, _, cameras = segment(seed, CAMERA, Lens(CAMERA), 0.0, yaw, base, 0.5)
+        key = CAMERA.project(LEVEL.inverse().apply(tracks.landmarks.position))
+        points = SegmentPoints(np.stack([key, *tracks.pixels], 1), tracks.landmarks, CAMERA, LEVEL)
+        parts.append({"per_frame": resect_segment(points, [0, 1, 2], PARAMS).facts, "intrinsics": {}})
+    parts += [{"per_frame": [], "intrinsics": {}}] * (4 - refused)
+    given = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": False})
+    segments = [Bundle({}, one) for one in parts]
+    facts = intrinsics_stage.run(IntrinsicsParams(), {}, {"segments": segments, "rig": given}).meta
+    assert facts["correction"][-1] == pytest.approx(-yaw * (refused > 1), rel=0.1)
 
 
 @pytest.mark.parametrize("changed", [False, True])
