@@ -240,18 +240,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
-        counts = [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
-        called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
-        remedy = f"give the folder of both cameras, {called}, or write a manifest by hand"
-        for path in images[: 1 if sum(counts) in (0, len(images)) and not all(counts) else 0]:
-            with suppress(InputError):
-                header = common_header([path]).header
-                if not header.height <= header.width < 2 * header.height:
-                    remedy = f"{split('each shows', 'FILE')}; else {remedy}"
-        remedy = remedy if images else "name the folder that holds the images, or a folder nearer to them"
-        text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
-        text += "" if images else f" ({DEPTH} folders deep)"
-        raise InputError("RIL-194", text, remedy=remedy)
+        raise _no_pairs(folder, images, [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)])
     # Photographs first, then most pairs; of equally many the surest token (SIDES), and the shortest name.
     key = max(both, key=lambda k: (not COMPUTED.search(k[1]), min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
@@ -282,6 +271,22 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         tuple(lines),
         (*others, *([f"{count(len(alone), 'image')} ({alone[0]} ...): of neither camera by name"] if alone else ())),
     )
+
+
+def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
+    """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
+    text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
+    called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
+    remedy = f"give the folder of both cameras, {called}, or write a manifest by hand"
+    if not images:
+        text += f" ({DEPTH} folders deep)"
+        remedy = "name the folder that holds the images, or a folder nearer to them"
+    elif sum(counts) in (0, len(images)) and not all(counts):
+        with suppress(InputError):
+            header = common_header(images[:1]).header
+            if not header.height <= header.width < 2 * header.height:
+                remedy = f"{split('each shows', 'FILE')}; else {remedy}"
+    return InputError("RIL-194", text, remedy=remedy)
 
 
 def _place(path: Path, without: str) -> str:

@@ -301,6 +301,18 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         wrong[departure.argmax()] = True
 
 
+def alone(shown: Floats, least: float, *, change: bool = False) -> tuple[CommonErrors, float]:
+    """Estimate of one number alone from what segments show, (segment, 2) information and pull, and its value if enough
+    of them agree that it is not 0; or the estimate of this number and of its ``change`` from the first segment to the
+    last, and that change."""
+    by = np.vander(np.linspace(-0.5, 0.5, len(shown)), 1 + change, increasing=True)
+    # Any is as likely: drawn to 0 by a prior, few segments that agree would seem to contradict each other.
+    free = np.full(1 + change, math.pi)
+    found = common_errors(shown[:, :1, None] * by[:, :, None] * by[:, None], shown[:, 1:] * by, free, least)
+    enough = found.wrong[-1] and len(shown) >= MIN_YAW_SEGMENTS * len(free)
+    return found, float(found.errors[-1]) if enough else 0.0
+
+
 def px_per_yaw(rig: Rig) -> float:
     """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it."""
     far = np.array([[0.0, 0.0, 100.0 * rig.baseline]])
@@ -422,20 +434,11 @@ def intrinsics_stage(
         MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
     )
 
-    def alone(name: str, least: float, *, change: bool = False) -> tuple[CommonErrors, float]:
-        """Estimate of one number alone, and its value, if enough segments agree that it is not 0; or the estimate of
-        this number and of its ``change`` from the first segment to the last, and that change."""
-        shown = np.array([part[name] for part in parts]).reshape(-1, 2)
-        by = np.vander(np.linspace(-0.5, 0.5, len(parts)), 1 + change, increasing=True)
-        # Any is as likely: drawn to 0 by a prior, few segments that agree would seem to contradict each other.
-        free = np.full(1 + change, math.pi)
-        found = common_errors(shown[:, :1, None] * by[:, :, None] * by[:, None], shown[:, 1:] * by, free, least)
-        enough = found.wrong[-1] and len(parts) >= MIN_YAW_SEGMENTS * len(free)
-        return found, float(found.errors[-1]) if enough else 0.0
-
-    yaw, turn = alone("yaw", (MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX) / focal)
-    bend, bent = alone("yaw", MIN_YAW_PX / focal, change=True)
-    read_out, late = alone("read_out", MIN_READ_OUT)
+    shown = {name: np.array([part[name] for part in parts]).reshape(-1, 2) for name in ("yaw", "read_out")}
+    least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
+    yaw, turn = alone(shown["yaw"], least / focal)
+    bend, bent = alone(shown["yaw"], MIN_YAW_PX / focal, change=True)
+    read_out, late = alone(shown["read_out"], MIN_READ_OUT)
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
     late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))

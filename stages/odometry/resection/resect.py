@@ -105,21 +105,6 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
     doubt: AmbiguousError | None = None
     trusted = np.ones(len(known), bool)
 
-    def common_bias(use: NDArray[np.intp], j: int, agreeing: int) -> dict[str, float]:
-        """Error of all disparities, px, with which most landmarks agree with one pose, if as calibrated few do.
-
-        A rig that is turned aside looks like a zoom, or like two motions.
-        """
-        # 0.5: of the landmarks; of a rig that is turned by 0.5 degrees 0.9 agree then, by 1.5 degrees 0.6.
-        if j > 1 or agreeing >= 0.5 * use.size:
-            return {}
-        pixels, free = points.tracks[use, j].astype(np.float64), params.model_copy(update={"bias_sigma": FREE_BIAS_PX})
-        try:
-            posed = resect(points.landmarks.take(use), pixels, points.camera, [key], free, frames[j])
-        except DegenerateError:
-            return {}
-        return {"bias_px": posed.bias} if posed.inlier.sum() >= 0.5 * use.size else {}
-
     def posed_by(use: NDArray[np.intp], j: int) -> Resection:
         pixels, landmarks = points.tracks[use, j].astype(np.float64), points.landmarks.take(use)
         bound = CONTRADICTION * params.threshold
@@ -156,7 +141,7 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
                 raise DegenerateError("RIL-751", text, remedy="mask what moves by itself, or what repeats")
         except DegenerateError as error:
             facts["lost"] = error.message.removeprefix(f"frame {frames[j]}: ")
-            facts |= common_bias(use, j, 0)
+            facts |= common_bias(points, use, 0, params, frames[j]) if j == 1 else {}
             if isinstance(error, AmbiguousError) and not doubt:
                 facts["contradiction"] = f"frame {frames[j]} shows {facts['lost']}: {error.remedy}"
                 doubt = AmbiguousError(error.code, f"two motions since frame {frames[j]}")
@@ -164,11 +149,31 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
         last = posed.T_local_left
         out.poses[j], out.covariance[j], out.shared[j] = last.matrix34, posed.covariance, posed.shared
         out.inlier[use, j] = posed.inlier
-        facts |= {"inliers": agreeing, "rms_px": posed.rms_px} | common_bias(use, j, agreeing)
+        facts |= {"inliers": agreeing, "rms_px": posed.rms_px}
+        facts |= common_bias(points, use, agreeing, params, frames[j]) if j == 1 else {}
         facts |= {} if trusted.all() else {"moving": int((known[:, j] & ~trusted).sum())}
         block_scatters.append(posed.block_scatter)
     out.covariance[:] = total_covariance(out.covariance, out.shared, block_scatters)
     return out
+
+
+def common_bias(
+    points: SegmentPoints, use: NDArray[np.intp], agreeing: int, params: ResectParams, frame: int
+) -> dict[str, float]:
+    """Error of all disparities, px, with which most landmarks agree with one pose of the second frame, if as calibrated
+    few do, ``agreeing`` of those in ``use``.
+
+    A rig that is turned aside looks like a zoom, or like two motions.
+    """
+    # 0.5: of the landmarks; of a rig that is turned by 0.5 degrees 0.9 agree then, by 1.5 degrees 0.6.
+    if agreeing >= 0.5 * use.size:
+        return {}
+    pixels, free = points.tracks[use, 1].astype(np.float64), params.model_copy(update={"bias_sigma": FREE_BIAS_PX})
+    try:
+        posed = resect(points.landmarks.take(use), pixels, points.camera, [points.T_local_key], free, frame)
+    except DegenerateError:
+        return {}
+    return {"bias_px": posed.bias} if posed.inlier.sum() >= 0.5 * use.size else {}
 
 
 def adjust_segment(

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -223,11 +224,13 @@ def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_p
 
 
 def test_a_program_from_standard_input_has_no_file_that_workers_would_read(monkeypatch):
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", "<stdin>")
+    program = types.ModuleType("__main__")
+    program.__file__ = "<stdin>"
+    monkeypatch.setitem(sys.modules, "__main__", program)
     workers.check("inline")
-    assert sys.modules["__main__"].__file__ == "<stdin>"
+    assert program.__file__ == "<stdin>"
     workers.check("dask")
-    assert not hasattr(sys.modules["__main__"], "__file__")
+    assert not hasattr(program, "__file__")
 
 
 def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):
