@@ -277,15 +277,14 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
     text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
-    remedy = f"give the folder of both cameras, {called}, or write a manifest by hand"
-    if not images:
-        text += f" ({DEPTH} folders deep)"
-        remedy = "name the folder that holds the images, or a folder nearer to them"
-    elif sum(counts) in (0, len(images)) and not all(counts):
+    by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
+    remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"
+    text += "" if images else f" ({DEPTH} folders deep)"
+    if images and sum(counts) in (0, len(images)) and not all(counts):
         with suppress(InputError):
             header = common_header(images[:1]).header
             if not header.height <= header.width < 2 * header.height:
-                remedy = f"{split('each shows', 'FILE')}; else {remedy}"
+                remedy = f"{split('each shows', 'FILE')}; else {by_name}"
     return InputError("RIL-194", text, remedy=remedy)
 
 
