@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,6 @@ COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radi
 
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
 """Part of keys that only look like those of a lens: of its errors, or of names."""
-
-NOT_ZERO = re.compile(r"[-+]?[0.]*[1-9]")
 
 
 class Fields:
@@ -219,7 +217,7 @@ class Fields:
         named = {key: model for key, value in self.values.items() if (model := _named(key, value))}
         self.used |= {self.at + key for key in named}
         keys = {model: key for key, model in named.items()}
-        if not any(map(NOT_ZERO.match, map(str, _flat(self.values.get(coefficients)) or "1"))):
+        if not _any_but_zero(_flat(self.values.get(coefficients)) or [1]):
             keys.pop("realsense", None)
         if unread := keys.get("unread", keys.get("realsense")):
             text = f"= {_shown(self.values[unread])} is a lens model that is not read"
@@ -294,6 +292,11 @@ def _named(key: str, value: Any) -> str:
     return model if of_lens or (word in MODELS and len(word) > 3 and model in ("fisheye", "unread")) else ""
 
 
+def _any_but_zero(values: Iterable[Any]) -> bool:
+    """Whether any value, perhaps as text, is a number other than 0."""
+    return any(re.match(r"[-+]?[0.]*[1-9]", str(value)) for value in values)
+
+
 def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tuple[str, Any]]:
     """Full key and value of entries of a lens that no reader has read, except coefficients of zero."""
     for key, value in ((str(k), v) for k, v in values.items()):
@@ -302,7 +305,7 @@ def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tup
             yield from _untaken(value, f"{path}.", used)
         elif path not in used and not OTHER.search(path):
             of_lens = (LENS if flat is not None and len(flat) > 1 else COEFFICIENT).search(key)
-            if _named(key, value) or (of_lens and any(map(NOT_ZERO.match, map(str, flat or [value])))):
+            if _named(key, value) or (of_lens and _any_but_zero(flat or [value])):
                 yield path, value
 
 

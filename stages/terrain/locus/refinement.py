@@ -54,7 +54,7 @@ def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: in
     for _ in range(steps):
         keep = np.isfinite(seen.scale)
         weight, rest = _misfit(seen, keep)
-        slope = np.where(keep, 0.5 * (seen.right_slope - seen.left_slope), np.float32(0.0))
+        slope = np.where(keep, seen.slope(), np.float32(0.0))
         bends = bend_weights(z, seen.scale, MAX_BEND_PX, BEND_STIFFNESS)
         moved = relax(z, weight * slope * slope, weight * slope * rest, bends, keep, sweeps=20)
         # About the start, not the last step: many small steps could otherwise wander to another likeness. Beyond a

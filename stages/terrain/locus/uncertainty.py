@@ -136,7 +136,7 @@ def _mean(values: Floats32 | Bools, side: int, count: NDArray[Any]) -> Floats32:
 
 def _gradients(seen: OrthoPair, scale: Floats32, known: Bools) -> Floats32:
     """Sum of the squared gradients around each cell, squared grey levels a pixel of disparity."""
-    slope = 0.5 * (seen.right_slope - seen.left_slope) / scale
+    slope = seen.slope() / scale
     power = np.where(known, np.square(slope) * np.minimum(seen.area, 1.0), np.float32(0.0))
     # One squared grey level a pixel, of each cell: so that a blank wall is not divided by.
     return np.maximum(window_sum32(power, NEAR_SIDE_CELLS), np.float32(0.0)) + np.float32(NEAR_SIDE_CELLS**2)

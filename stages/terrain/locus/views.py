@@ -4,10 +4,10 @@ A cell is the point P = (x, y, Z); its projections p_l and p_r are read from the
 pixels, so that detail is kept. With the terrain right, both show the same.
 
 How their difference changes with the elevation follows from either image: while a cell moves along the ray of one
-camera, this one goes on to show the same, and in the other the cell moves by its disparity. The mean of both has half
-the variance, and both have as little noise as disparities need. The change of each image at a cell that rises straight
-up, instead, is mostly motion that both images share, with the noise of two gradients times that motion: many times the
-disparity where the baseline is short for the distance.
+camera, that camera goes on to show the same, and in the other one the cell moves by its disparity. The mean of both has
+half the variance, and both have as little noise as disparities need. The change of each image at a cell that rises
+straight up, instead, is mostly motion that both images share, with the noise of two gradients times that motion: many
+times the disparity where the baseline is short for the distance.
 """
 
 from __future__ import annotations
@@ -54,6 +54,10 @@ class OrthoPair(NamedTuple):
     scale: Floats32
     area: Floats32
     right_slope: Floats32
+
+    def slope(self) -> Floats32:
+        """Change (rows, cols) of the right image's grey values less the left one's, per metre of elevation."""
+        return np.asarray(0.5 * (self.right_slope - self.left_slope), np.float32)
 
 
 def look(views: SurfaceViews, lattice: Lattice, elevation: Floats | Floats32) -> OrthoPair:
@@ -105,20 +109,13 @@ def _look(xs, ys, zs, cell, views, out):  # type: ignore[no-untyped-def]
             if not (_is_inside(at, spline.shape) and _is_inside(at_right, spline_right.shape)):
                 continue
             grey, gx, gy = value_and_gradient(spline, at[0], at[1])
-            across, along, up = _motion(P, at, 0), _motion(P, at, 1), _motion(P, at, 2)
-            dx, dy = (x - right_centre[0]) / below_right, (y - right_centre[1]) / below_right
-            shift = dx * across[0] + dy * along[0] + up[0], dx * across[1] + dy * along[1] + up[1]
+            shift = _shift(P, at, (x - right_centre[0]) / below_right, (y - right_centre[1]) / below_right)
             left[r, c], left_slope[r, c] = grey, gx * shift[0] + gy * shift[1]
+            across, along = _motion(P, at, 0), _motion(P, at, 1)
             area[r, c] = abs(along[0] * across[1] - across[0] * along[1]) * cell * cell
             grey, gx, gy = value_and_gradient(spline_right, at_right[0], at_right[1])
-            across, along, up = (
-                _motion(P_right, at_right, 0),
-                _motion(P_right, at_right, 1),
-                _motion(P_right, at_right, 2),
-            )
             # Along the left ray the left projection stays: the motion of the right one is disparity.
-            dx, dy = (x - centre[0]) / below, (y - centre[1]) / below
-            shift = dx * across[0] + dy * along[0] + up[0], dx * across[1] + dy * along[1] + up[1]
+            shift = _shift(P_right, at_right, (x - centre[0]) / below, (y - centre[1]) / below)
             right[r, c], right_slope[r, c] = grey, gx * shift[0] + gy * shift[1]
             scale[r, c] = math.hypot(shift[0], shift[1])
 
@@ -137,6 +134,13 @@ def _is_inside(at, shape):  # type: ignore[no-untyped-def]
     x, y, part = at
     rows, cols = shape
     return part > 0.0 and x >= 1.0 and y >= 1.0 and x < cols - 2.0 and y < rows - 2.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shift(P, at, dx, dy):  # type: ignore[no-untyped-def]
+    """Pixels that the projection ``at`` of a point moves by a metre of elevation along the direction (dx, dy, 1)."""
+    across, along, up = _motion(P, at, 0), _motion(P, at, 1), _motion(P, at, 2)
+    return dx * across[0] + dy * along[0] + up[0], dx * across[1] + dy * along[1] + up[1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
