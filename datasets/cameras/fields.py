@@ -40,6 +40,14 @@ Names of "" do not tell the distortion; those of "unread" are unsupported models
 unless all coefficients are 0 (its inverse model takes off by the formula that puts on elsewhere).
 """
 
+COEFFICIENTS: Mapping[str, str] = {
+    "none": "",
+    "radtan": "k1 k2 p1 p2 k3",
+    "rational": "k1 k2 p1 p2 k3 k4 k5 k6",
+    "fisheye": "k1 k2 k3 k4",
+}
+"""Usual keys of the coefficients of each lens model, in its order."""
+
 LENS = re.compile(
     r"dist(?!an[ct]|rib|inc)|fish|lens_?(model|type|dist|par|coef|$)|cam(era)?_?\d?[._]?(model|type)"
     r"|proj(ection)?_?(model|type)|radial|tangential|prism|coef|(^|[._ ])d\d?$",
@@ -172,20 +180,25 @@ class Fields:
         with self._within(key):
             return Lens(camera, model, coefficients)
 
-    def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
-        """Lens of numbers with a key each.
+    def optics(
+        self, pinhole: str, size: tuple[int, int], model: str = "", corner: float = 0.0, prefix: str = ""
+    ) -> Lens:
+        """Lens of numbers with a key each, those of the coefficients by :data:`COEFFICIENTS`.
+
+        Missing coefficients are 0, except for a fisheye, and if all are missing, there is no distortion.
 
         Parameters
         ----------
         pinhole : keys of fx, fy, cx and cy (``"f f cx cy"``), pixels.
-        model, coefficients : of :mod:`rille.stages.geometry.lens`, and their keys in its order; missing ones are 0,
-            except for a fisheye, and if all are missing, there is no distortion.
+        model : of :mod:`rille.stages.geometry.lens`; empty: radial-tangential, unless an entry names a fisheye.
         corner : pixels; 0.5 if the corner of the first pixel is at 0 in the program, 0 if its centre is.
+        prefix : of all keys.
         """
-        keys = pinhole.split()
+        keys = [prefix + key for key in pinhole.split()]
+        model = model or ("fisheye" if self.model(f"{prefix}k1") == "fisheye" else "radtan")
         fx, fy, cx, cy = (self.number(key) for key in keys)
         camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
-        keys = coefficients.split()
+        keys = [prefix + key for key in COEFFICIENTS[model].split()]
         if not self.has(*keys):
             return Lens(camera)
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)
