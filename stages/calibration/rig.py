@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
-from pydantic import Field
 
 from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.calibration.lens_reading import better_reading
@@ -59,13 +58,15 @@ from rille.stages.numeric.robust import mad_sigma
 
 
 class RigParams(RelativeParams):
-    """Parameters of the stage ``rig``."""
+    """Parameters of the stage ``rig``.
 
-    mode: Literal["pooled", "per_pair", "fixed"] = Field(
-        "pooled",
-        description="pooled: one rig from all pairs; per_pair: a rig for each pair (a rig that bends); fixed: keep "
-        "the given rig, report contradictions only",
-    )
+    Attributes
+    ----------
+    mode : pooled: one rig from all pairs; per_pair: a rig for each pair (a rig that bends); fixed: keep the given rig,
+        report contradictions only.
+    """
+
+    mode: Literal["pooled", "per_pair", "fixed"] = "pooled"
 
 
 def orient_rig(

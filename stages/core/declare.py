@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Concatenate, Generic, ParamSpec, TypedDict, cast, get_args, get_origin, get_type_hints
@@ -31,7 +32,10 @@ M = TypeVar("M", bound="Params")
 
 
 class Params(BaseModel):
-    """Base of all parameter models: frozen, unknown keys refused, no infinities."""
+    """Base of all parameter models: frozen, unknown keys refused, no infinities.
+
+    The docstring of a model says under ``Attributes`` what each parameter means: a change of words changes no key.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
@@ -43,6 +47,13 @@ class Params(BaseModel):
         if isinstance(value, bool) and bool not in (annotation, *get_args(annotation)):
             raise ValueError("input should be a number, no switch")
         return value
+
+    @classmethod
+    def meanings(cls) -> dict[str, str]:
+        """What each parameter means, by name, as the docstrings of the model and of its bases say."""
+        texts = (inspect.cleandoc(base.__doc__ or "") for base in reversed(cls.__mro__))
+        entries = (entry for text in texts for entry in re.findall(r"^(\w+) : (.*(?:\n    .*)*)", text, re.MULTILINE))
+        return {name: " ".join(words.split()) for name, words in entries}
 
 
 class NoParams(Params):

@@ -93,15 +93,16 @@ read before the next one is: beyond an interval the tracks show something else, 
 
 
 class IntrinsicsParams(Params):
-    """Parameters of the stage ``intrinsics``."""
+    """Parameters of the stage ``intrinsics``.
 
-    prior: float = Field(
-        0.005,
-        gt=0,
-        description="standard deviation, as calibrated, of the focal length and of the principal point over the focal "
-        "length, and of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual "
-        "for a calibration with a target",
-    )
+    Attributes
+    ----------
+    prior : standard deviation, as calibrated, of the focal length and of the principal point over the focal length, and
+        of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual for a calibration
+        with a target.
+    """
+
+    prior: float = Field(0.005, gt=0)
 
     @property
     def sigma(self) -> Floats:
