@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import COEFFICIENTS, Fields
+from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import COEFFICIENTS
 
 MODELS = {
     "SIMPLE_PINHOLE": ("f cx cy", "none"),
@@ -48,7 +49,7 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
         if len(values) != len(names):
             count = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
             raise f.error("RIL-109", "parameters", count)
-        zeros = dict.fromkeys(COEFFICIENTS[lens].split(), "0")
+        zeros = dict.fromkeys(COEFFICIENTS[lens], "0")
         stated = dict(zip(names, values, strict=True)) | {"width": width, "height": height}
         f = Fields(zeros | stated, str(path), f.at)
         pinhole = "f f cx cy" if "f" in f else "fx fy cx cy"

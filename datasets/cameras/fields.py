@@ -17,7 +17,7 @@ from rille.datasets.text.reading import GREATEST, read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
 CORRECT = "correct the calibration file"
 
@@ -39,14 +39,6 @@ MODELS: Mapping[str, str] = {
 Names of "" do not tell the distortion; those of "unread" are unsupported models, and so are those of "realsense",
 unless all coefficients are 0 (its inverse model takes off by the formula that puts on elsewhere).
 """
-
-COEFFICIENTS: Mapping[str, str] = {
-    "none": "",
-    "radtan": "k1 k2 p1 p2 k3",
-    "rational": "k1 k2 p1 p2 k3 k4 k5 k6",
-    "fisheye": "k1 k2 k3 k4",
-}
-"""Usual keys of the coefficients of each lens model, in its order."""
 
 LENS = re.compile(
     r"dist(?!an[ct]|rib|inc)|fish|lens_?(model|type|dist|par|coef|$)|cam(era)?_?\d?[._]?(model|type)"
@@ -183,7 +175,7 @@ class Fields:
     def optics(
         self, pinhole: str, size: tuple[int, int], model: str = "", corner: float = 0.0, prefix: str = ""
     ) -> Lens:
-        """Lens of numbers with a key each, those of the coefficients by :data:`COEFFICIENTS`.
+        """Lens of numbers with a key each, those of the coefficients named as usual.
 
         Missing coefficients are 0, except for a fisheye, and if all are missing, there is no distortion.
 
@@ -198,7 +190,7 @@ class Fields:
         model = model or ("fisheye" if self.model(f"{prefix}k1") == "fisheye" else "radtan")
         fx, fy, cx, cy = (self.number(key) for key in keys)
         camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
-        keys = [prefix + key for key in COEFFICIENTS[model].split()]
+        keys = [prefix + key for key in COEFFICIENTS[model]]
         if not self.has(*keys):
             return Lens(camera)
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import COEFFICIENTS, Fields
+from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.text import assignments, entries
 from rille.stages.geometry.geometry import Camera
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
 LENSES = {"null": "none", "fisheye": "fisheye", "tsai": "radtan"}
 """Supported lens models: those of :mod:`rille.stages.geometry.lens`."""
@@ -60,5 +60,5 @@ def _lens(f: Fields, kind: str, camera: Camera) -> Lens:
     if model is None:
         remedy = "convert it by convert_pinhole_model --output-type TsaiLensDistortion"
         raise f.error("RIL-148", f"lens model {kind}", "is not read", remedy)
-    keys = [key for key in COEFFICIENTS[model].split() if model == "fisheye" or key != "k3" or key in f]
+    keys = [key for key in COEFFICIENTS[model] if model == "fisheye" or key != "k3" or key in f]
     return f.lens("k1", camera, model, tuple(map(f.number, keys)))
