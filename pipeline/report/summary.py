@@ -26,7 +26,7 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hfvm.coarse import ImageDifference
-from rille.stages.odometry.resection.intrinsics import CORRECTED
+from rille.stages.odometry.resection.calibration_errors import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.reference import camera_height, seen_up
 
