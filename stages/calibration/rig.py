@@ -53,7 +53,7 @@ from rille.stages.geometry.epipolar import (
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
-from rille.stages.geometry.sides import BeyondInfinityError, refuse_impossible, refuse_mirrored
+from rille.stages.geometry.sides import BeyondInfinityError, exchanged, refuse_impossible, refuse_mirrored
 from rille.stages.numeric.robust import mad_sigma
 
 
@@ -135,7 +135,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
         refuse_impossible(rig, left, right, share)
     elif applied:
         # The correction that mirrored images ask for may look like a knock.
-        refuse_mirrored(given, left, right)
+        refuse_mirrored(given, left, right, max(exchanged(given, left, right)[1:]))
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
