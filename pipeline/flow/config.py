@@ -214,14 +214,10 @@ def build(*layers: Mapping[str, Any]) -> Params:
     for layer in layers:
         merge(nested, layer)
     for section, preset, values in PRESETS:
-        if _preset(nested, section) == preset:
+        given = nested.get(section)
+        if isinstance(given, Mapping) and given.get("preset") == preset:
             nested = merge(merge({}, values), nested)
     return validate(model(), nested, also=DATASET_SECTIONS)
-
-
-def _preset(nested: Mapping[str, Any], section: str) -> Any:
-    values = nested.get(section)
-    return values.get("preset") if isinstance(values, Mapping) else None
 
 
 def suited(sequence: Sequence) -> dict[str, Any]:

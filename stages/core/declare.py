@@ -188,8 +188,7 @@ class Stage(Generic[M, F]):
 
     def __call__(self, *args: Any, **kwargs: Any) -> Bundle[F]:
         """Call the function that was declared."""
-        assert self.function is not None
-        return self.function(*args, **kwargs)
+        return (self.function or self.run)(*args, **kwargs)
 
 
 def stage(
@@ -280,7 +279,7 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
             raise TypeError(f"{stage.name}: array {name!r} is not declared")
         if array.dtype not in (np.dtype(spec.dtype), np.dtype(spec.deep or spec.dtype)) or array.ndim != len(spec.dims):
             raise TypeError(f"{stage.name}: {name} is {array.dtype} {array.ndim}-D, declared {spec.dtype} {spec.dims}")
-    missing = missing_outputs(stage, list(bundle.arrays))
+    missing = [a.name for a in stage.outputs if not a.optional and not any(map(a.matches, bundle.arrays))]
     if missing:
         raise TypeError(f"{stage.name}: declared arrays are missing: {', '.join(missing)}")
     if stage.facts is not None:
@@ -288,8 +287,3 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
         if not required <= bundle.meta.keys() <= required | optional:
             missing, unknown = sorted(required - bundle.meta.keys()), sorted(bundle.meta.keys() - required - optional)
             raise TypeError(f"{stage.name}: facts that are missing: {missing}, that are not declared: {unknown}")
-
-
-def missing_outputs(stage: Stage, names: Sequence[str]) -> list[str]:
-    """Declared, not optional arrays that ``names`` lacks."""
-    return [a.name for a in stage.outputs if not a.optional and not any(a.matches(n) for n in names)]
