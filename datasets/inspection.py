@@ -25,10 +25,10 @@ from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
-from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
+from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 DEPTH = 4

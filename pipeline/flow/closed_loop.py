@@ -40,7 +40,6 @@ import numpy as np
 from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
-from rille.datasets.text.count import count
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name_graph
@@ -48,6 +47,7 @@ from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError, DegenerateError
+from rille.stages.core.quantities import count
 from rille.stages.driving import obstacle_monitor
 from rille.stages.driving.fault_monitor import fault_monitor_stage
 from rille.stages.driving.obstacle_monitor import obstacle_monitor_stage

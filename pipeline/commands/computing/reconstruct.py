@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rille.datasets.text.warning import warning
 from rille.pipeline.commands import batch
 from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.engine.plain import some, warn
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
+from rille.stages.core.errors import warning
 
 
 def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:
