@@ -33,14 +33,13 @@ from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
 from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
-from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.datasets.text.times import seconds
-from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import InputError, within
+from rille.stages.core.errors import InputError, warning, within
+from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 FORMS = (

@@ -23,8 +23,7 @@ from rille.datasets.manifest.model import Cameras, Images, Imu, Manifest, Times,
 from rille.datasets.manifest.opening import open_described
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.warning import warning
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 
 TRUTH: Mapping[str, bool] = {

@@ -25,10 +25,10 @@ from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
-from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
+from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 DEPTH = 4
@@ -200,17 +200,14 @@ def _relative(path: Path, folder: Path) -> str:
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
-def find_views(folder: Path, images: list[Path]) -> FoundImages:
-    """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
+Sets = dict[tuple[int, str], tuple[list[Path], list[Path]]]
+"""Left and right images by the number of the tokens in their names (``SIDES``), and their place."""
 
-    Raises
-    ------
-    InputError
-        Names do not distinguish the images of two cameras.
-    """
+
+def _by_token(images: list[Path], names: list[str]) -> Sets:
+    """Images whose names have a side's token, in sets of one place; a set may have one side alone."""
     named: dict[tuple[int, str], list[tuple[str, int, Path]]] = defaultdict(list)
-    groups: dict[tuple[int, str], tuple[list[Path], list[Path]]] = defaultdict(lambda: ([], []))
-    names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
+    groups: Sets = defaultdict(lambda: ([], []))
     for path, name in zip(images, names, strict=True):
         if (at := side_of(name)) is not None:
             row, side, neutral = at
@@ -222,14 +219,34 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         words = {neutrals[i]: word for word, of in pairing.by_one_word(neutrals).items() for i in of}
         for neutral, side, path in found:
             groups[row, f"{place} {words.get(neutral, '')}"][side].append(path)
+    return groups
+
+
+def _of_both_sides(groups: Sets) -> Sets:
+    """The sets with both sides: one of each place; one of all numbered places, if each holds a frame; else one of the
+    only left and the only right images."""
     both = {key: sides for key, sides in groups.items() if all(sides)}
     frames = {(row, re.sub(r"\d+", "", place)) for row, place in both}
-    if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):  # a folder a frame
+    if len(frames) == 1 and all(len(left) == len(right) == 1 for left, right in both.values()):
         alike = [sides for (row, place), sides in groups.items() if (row, re.sub(r"\d+", "", place)) in frames]
-        both = {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
-    sets = [[key for key, sides in groups.items() if sides[side]] for side in (0, 1)]
-    if not both and all(len(keys) == 1 for keys in sets) and sets[0][0][0] == sets[1][0][0]:  # colour_left, mono_right
-        both = {sets[0][0]: (groups[sets[0][0]][0], groups[sets[1][0]][1])}
+        return {min(both): ([p for left, _ in alike for p in left], [p for _, right in alike for p in right])}
+    left, right = ([key for key, sides in groups.items() if sides[side]] for side in (0, 1))
+    if not both and len(left) == len(right) == 1 and left[0][0] == right[0][0]:  # colour_left, mono_right
+        return {left[0]: (groups[left[0]][0], groups[right[0]][1])}
+    return both
+
+
+def find_views(folder: Path, images: list[Path]) -> FoundImages:
+    """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
+
+    Raises
+    ------
+    InputError
+        Names do not distinguish the images of two cameras.
+    """
+    names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
+    groups = _by_token(images, names)
+    both = _of_both_sides(groups)
     # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
     parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
     of_word = [[images[i] for i in of] for of in parts.values()]

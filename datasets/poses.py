@@ -34,10 +34,9 @@ from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
 from rille.datasets.text.units import unitless
-from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.errors import InputError, within
+from rille.stages.core.errors import InputError, warning, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
 QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rille.pipeline.flow.config import stages
-from rille.stages.core.declare import declared
+from rille.stages.core.declare import Params, declared
 
 UNITS = {"1", "px", "m", "rad", "grey", "m^2, m rad, rad^2", "m, rad", "m/px"}
 DATASET_STAGES = ("images.files", "mockup.scene", "mockup.render", "mockup.truth", "mockup.truth_dem")
@@ -33,9 +33,37 @@ def test_declaration(name: str) -> None:
 @pytest.mark.parametrize("name", DECLARED)
 def test_every_parameter_is_explained_and_has_a_default(name: str) -> None:
     for key, field in DECLARED[name].params.model_fields.items():
-        assert field.description, f"{name}.{key} has no description"
+        assert DECLARED[name].params.meanings().get(key), f"{name}.{key} is not explained"
         assert not field.is_required(), f"{name}.{key} has no default"
     DECLARED[name].params()
+
+
+class Short(Params):
+    """A model.
+
+    Attributes
+    ----------
+    most : greatest [m]; here : no entry.
+    least : least
+        of all.
+    """
+
+    most: float = 1.0
+    least: float = 0.0
+
+
+class Long(Short):
+    """Another one, which means something else by one of them.
+
+    Attributes
+    ----------
+    least : zero.
+    """
+
+
+def test_parameters_mean_what_the_docstrings_say() -> None:
+    assert Short.meanings() == {"most": "greatest [m]; here : no entry.", "least": "least of all."}
+    assert Long.meanings() == {"most": "greatest [m]; here : no entry.", "least": "zero."}
 
 
 @pytest.mark.parametrize("name", DECLARED)

@@ -33,7 +33,7 @@ def _lens(f: Fields) -> Lens:
     p = f.sub("pinhole")
     if abs(p.number("skew", 0.0)) > 1e-6 * p.number("fx"):
         raise p.error("RIL-104", "skew", f"= {p.number('skew'):g} is not 0", "calibrate without skew")
-    camera = p.optics("fx fy cx cy", "none", "", p.size("width", "height"), corner=0.5).camera
+    camera = p.optics("fx fy cx cy", p.size("width", "height"), "none", corner=0.5).camera
     if "radial_tangential" not in f:
         return Lens(camera)
     bent = f.sub("radial_tangential")

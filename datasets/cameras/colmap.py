@@ -13,6 +13,7 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import COEFFICIENTS
 
 MODELS = {
     "SIMPLE_PINHOLE": ("f cx cy", "none"),
@@ -26,9 +27,6 @@ MODELS = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
 }
 """Supported camera models: the order of their parameters, and the lens (:mod:`rille.stages.geometry.lens`)."""
-
-COEFFICIENTS = {"none": "", "radtan": "k1 k2 p1 p2", "rational": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}
-"""Keys in the order of each lens."""
 
 
 def is_colmap(text: str) -> bool:
@@ -51,11 +49,11 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
         if len(values) != len(names):
             count = f"are {len(values)}, {model} takes {len(names)}: {' '.join(names)}"
             raise f.error("RIL-109", "parameters", count)
-        zeros = dict.fromkeys(COEFFICIENTS[lens].split(), "0")
+        zeros = dict.fromkeys(COEFFICIENTS[lens], "0")
         stated = dict(zip(names, values, strict=True)) | {"width": width, "height": height}
         f = Fields(zeros | stated, str(path), f.at)
         pinhole = "f f cx cy" if "f" in f else "fx fy cx cy"
-        optics = f.optics(pinhole, lens, COEFFICIENTS[lens], f.size("width", "height"), corner=0.5)
+        optics = f.optics(pinhole, f.size("width", "height"), lens, corner=0.5)
         cameras.append(CalibratedCamera(number, optics, poses.get(number)))
     return cameras
 

@@ -17,7 +17,7 @@ from rille.datasets.text.reading import GREATEST, read_text
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
 CORRECT = "correct the calibration file"
 
@@ -172,20 +172,25 @@ class Fields:
         with self._within(key):
             return Lens(camera, model, coefficients)
 
-    def optics(self, pinhole: str, model: str, coefficients: str, size: tuple[int, int], corner: float = 0.0) -> Lens:
-        """Lens of numbers with a key each.
+    def optics(
+        self, pinhole: str, size: tuple[int, int], model: str = "", corner: float = 0.0, prefix: str = ""
+    ) -> Lens:
+        """Lens of numbers with a key each, those of the coefficients named as usual.
+
+        Missing coefficients are 0, except for a fisheye, and if all are missing, there is no distortion.
 
         Parameters
         ----------
         pinhole : keys of fx, fy, cx and cy (``"f f cx cy"``), pixels.
-        model, coefficients : of :mod:`rille.stages.geometry.lens`, and their keys in its order; missing ones are 0,
-            except for a fisheye, and if all are missing, there is no distortion.
+        model : of :mod:`rille.stages.geometry.lens`; empty: radial-tangential, unless an entry names a fisheye.
         corner : pixels; 0.5 if the corner of the first pixel is at 0 in the program, 0 if its centre is.
+        prefix : of all keys.
         """
-        keys = pinhole.split()
+        keys = [prefix + key for key in pinhole.split()]
+        model = model or ("fisheye" if self.model(f"{prefix}k1") == "fisheye" else "radtan")
         fx, fy, cx, cy = (self.number(key) for key in keys)
         camera = self.camera(keys[0], (fx, fy, cx - corner, cy - corner), size)
-        keys = coefficients.split()
+        keys = [prefix + key for key in COEFFICIENTS[model]]
         if not self.has(*keys):
             return Lens(camera)
         values = tuple(self.number(key, None if model == "fisheye" else 0.0) for key in keys)

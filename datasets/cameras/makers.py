@@ -71,9 +71,7 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
-    fisheye = "k4" in f and "p1" not in f
-    model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("rational", "k1 k2 p1 p2 k3 k4 k5 k6")
-    lens = f.optics("fx fy cx cy", model, keys, size)
+    lens = f.optics("fx fy cx cy", size, "fisheye" if "k4" in f and "p1" not in f else "rational")
     f.check_lens()
     return lens
 
@@ -135,7 +133,7 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
         rows = ((key.lower(), value.split()) for key, value in re.findall(r"(\w+)[^:\n]*:(.*)", body))
         stated = {key: row if key == "coeffs" else " ".join(row) for key, row in rows}
         f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
-        camera = f.optics("fx fy ppx ppy", "none", "", f.size("width", "height")).camera
+        camera = f.optics("fx fy ppx ppy", f.size("width", "height"), "none").camera
         pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
         cameras[number, camera.width, camera.height] = CalibratedCamera(
             f"Infrared {number}", f.distorted("coeffs", camera), pose
@@ -198,13 +196,9 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
     """
     lenses = []
     for part in _parts(f):
-        if "coeffs" in part and "model" in part:  # as RealSense's library states them
-            camera = part.optics(f"fx fy {_centre(part)}", "none", "", part.size("width", "height")).camera
-            lenses.append(part.distorted("coeffs", camera))
-            continue
-        fisheye = part.model("k1") == "fisheye"
-        model, keys = ("fisheye", "k1 k2 k3 k4") if fisheye else ("radtan", "k1 k2 p1 p2 k3")
-        lenses.append(part.optics(f"fx fy {_centre(part)}", model, keys, part.size("width", "height")))
+        listed = "coeffs" in part and "model" in part  # as RealSense's library states them
+        lens = part.optics(f"fx fy {_centre(part)}", part.size("width", "height"), "none" if listed else "")
+        lenses.append(part.distorted("coeffs", lens.camera) if listed else lens)
     rig = _flat(f)
     T_right_left = relative(rig)
     if T_right_left is None and "baseline" in rig:

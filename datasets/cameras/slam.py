@@ -16,12 +16,8 @@ from rille.stages.geometry.lens import Lens
 
 CAMERA = re.compile(r"cam(\d+)")
 
-BASALT: Mapping[str, tuple[str, str]] = {
-    "pinhole": ("none", ""),
-    "kb4": ("fisheye", "k1 k2 k3 k4"),
-    "pinhole-radtan8": ("rational", "k1 k2 p1 p2 k3 k4 k5 k6"),
-}
-"""Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`, keys of its coefficients."""
+BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
+"""Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
 
 CAMODOCAL: Mapping[str, tuple[str, str, str]] = {
     "PINHOLE": ("fx fy cx cy", "radtan", "k1 k2 p1 p2"),
@@ -72,7 +68,7 @@ def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:
     pinhole, model, coefficients = CAMODOCAL[kind]
     p = f.sub("projection_parameters")
     d = p if kind == "KANNALA_BRANDT" else f.sub("distortion_parameters")
-    camera = p.optics(pinhole, "none", "", f.size("image_width", "image_height")).camera
+    camera = p.optics(pinhole, f.size("image_width", "image_height"), "none").camera
     lens = d.lens(coefficients, camera, model, tuple(d.number(key) for key in coefficients.split()))
     T = f.transform("extrinsicRotation", "extrinsicTranslation").inverse() if "extrinsicRotation" in f else None
     return [CalibratedCamera(path.stem, lens, T)]
@@ -107,7 +103,7 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
             raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
         if abs(np.linalg.norm(q) - 1) > 0.01:
             raise pose.error("RIL-767", "qx, qy, qz, qw", f"have length {np.linalg.norm(q):.4g}, it should be 1")
-        lens = camera.sub("intrinsics").optics("fx fy cx cy", *BASALT[kind], sizes.pair_of_pixels(k))
+        lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.pair_of_pixels(k), BASALT[kind])
         T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
         found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
     return found
@@ -150,18 +146,11 @@ def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
     """
     first = "Camera1" if "Camera1.fx" in f else "Camera"
     size = f.size("Camera.width", "Camera.height")
-    left = _orbslam_lens(f, first, size)
+    left = f.optics("fx fy cx cy", size, prefix=f"{first}.")
     if "Stereo.T_c1_c2" in f:
-        right = _orbslam_lens(f, "Camera2" if "Camera2.fx" in f else first, size)
+        right = f.optics("fx fy cx cy", size, prefix="Camera2." if "Camera2.fx" in f else f"{first}.")
         return stereo_cameras(left, right, f.pose("Stereo.T_c1_c2").inverse())
     if "Stereo.b" in f or "Camera.bf" in f:
         baseline = f.number("Stereo.b") if "Stereo.b" in f else f.number("Camera.bf") / left.camera.fx
         return stereo_cameras(left, left, parallel(abs(baseline)))
     return [CalibratedCamera(path.stem, left)]
-
-
-def _orbslam_lens(f: Fields, name: str, size: tuple[int, int]) -> Lens:
-    model = "fisheye" if f.model(f"{name}.k1") == "fisheye" else "radtan"
-    letters = ("k1", "k2", "k3", "k4") if model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
-    pinhole, coefficients = (" ".join(f"{name}.{key}" for key in of) for of in (("fx", "fy", "cx", "cy"), letters))
-    return f.optics(pinhole, model, coefficients, size)

@@ -18,10 +18,10 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.text import assignments, entries
 from rille.stages.geometry.geometry import Camera
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
-LENSES = {"null": ("none", ""), "fisheye": ("fisheye", "k1 k2 k3 k4"), "tsai": ("radtan", "k1 k2 p1 p2")}
-"""Supported lens models: those of :mod:`rille.stages.geometry.lens`, and the keys of their coefficients."""
+LENSES = {"null": "none", "fisheye": "fisheye", "tsai": "radtan"}
+"""Supported lens models: those of :mod:`rille.stages.geometry.lens`."""
 
 HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 
@@ -60,6 +60,5 @@ def _lens(f: Fields, kind: str, camera: Camera) -> Lens:
     if model is None:
         remedy = "convert it by convert_pinhole_model --output-type TsaiLensDistortion"
         raise f.error("RIL-148", f"lens model {kind}", "is not read", remedy)
-    name, keys = model
-    optional = ["k3"] if name == "radtan" and "k3" in f else []
-    return f.lens("k1", camera, name, tuple(f.number(key) for key in [*keys.split(), *optional]))
+    keys = [key for key in COEFFICIENTS[model] if model == "fisheye" or key != "k3" or key in f]
+    return f.lens("k1", camera, model, tuple(map(f.number, keys)))

@@ -18,11 +18,11 @@ from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.headers import opened
 from rille.datasets.images.pairing import ends, natural, without_side
-from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, within
+from rille.stages.core.quantities import count
 
 Sign = Literal["left-right", "right-left"]
 

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import PurePath
 
-from rille.datasets.text.count import count
+from rille.stages.core.quantities import count
 
 
 def split(what: str, name: str) -> str:

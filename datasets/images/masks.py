@@ -14,10 +14,9 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.protocol import Sequence, Source
-from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Bools
 from rille.stages.core.declare import AnyArray, Bundle, NoParams, stage
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 
 
 def usable(mask: AnyArray) -> Bools:

@@ -24,21 +24,20 @@ from rille.stages.geometry.lens import Lens
 
 
 class MisalignParams(Params):
-    """How the right camera is knocked; all 0: not at all."""
+    """How the right camera is knocked; all 0: not at all.
 
-    rows: float = Field(
-        0.0, ge=-200, le=200, description="shift of the right image downwards [pixels], as by a shifted sensor"
-    )
-    roll_deg: float = Field(0.0, ge=-45, le=45, description="clockwise turn of the right image [degrees]")
-    pitch_deg: float = Field(
-        0.0, ge=-20, le=20, description="turn about the right camera's x axis [degrees]; the image's contents move up"
-    )
-    yaw_deg: float = Field(
-        0.0,
-        ge=-20,
-        le=20,
-        description="turn about the right camera's y axis [degrees]; the image's contents move right",
-    )
+    Attributes
+    ----------
+    rows : shift of the right image downwards [pixels], as by a shifted sensor.
+    roll_deg : clockwise turn of the right image [degrees].
+    pitch_deg : turn about the right camera's x axis [degrees]; the image's contents move up.
+    yaw_deg : turn about the right camera's y axis [degrees]; the image's contents move right.
+    """
+
+    rows: float = Field(0.0, ge=-200, le=200)
+    roll_deg: float = Field(0.0, ge=-45, le=45)
+    pitch_deg: float = Field(0.0, ge=-20, le=20)
+    yaw_deg: float = Field(0.0, ge=-20, le=20)
 
     @property
     def none(self) -> bool:

@@ -16,10 +16,9 @@ import numpy as np
 
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
-from rille.datasets.text.count import count
 from rille.datasets.text.times import seconds, undated
-from rille.datasets.text.warning import warning
-from rille.stages.core.errors import IncompleteError, InputError
+from rille.stages.core.errors import IncompleteError, InputError, warning
+from rille.stages.core.quantities import count
 
 STAMP = re.compile(r"(?<!\d)[1-9]\d{9}(?:[_-]\d{9}|\d*(?:\.\d+)?)(?!\d)")
 """Seconds since 1970 have ten digits, with fractions more; frame numbers have fewer, or leading zeros."""

@@ -15,9 +15,8 @@ from PIL import Image
 from rille.datasets.images import files
 from rille.datasets.images.headers import orientation
 from rille.datasets.protocol import CAMERAS, Sequence, Source
-from rille.datasets.text.warning import warning
 from rille.stages.core.declare import AnyArray, declared
-from rille.stages.core.errors import InputError, RilleError
+from rille.stages.core.errors import InputError, RilleError, warning
 from rille.stages.imaging import levels
 
 FORMATS = ("JPEG", "TIFF", "PNG")

@@ -14,8 +14,7 @@ from rille.datasets.cameras.pair import MAX_OFF_CENTRE
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.protocol import Vector, vector_of
 from rille.datasets.text.reading import read_toml
-from rille.datasets.text.warning import warning
-from rille.stages.core.errors import InputError, within
+from rille.stages.core.errors import InputError, warning, within
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes
 from rille.stages.geometry.lens import Lens
 

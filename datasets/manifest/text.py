@@ -11,8 +11,8 @@ import tomli_w
 
 from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
 from rille.datasets.manifest.rig import LONGEST_BASELINE
-from rille.datasets.text.count import count
 from rille.datasets.text.names import derived_name
+from rille.stages.core.quantities import count
 
 NEEDED = "NEEDED"
 """Mark of a line that must be filled in before the manifest opens."""

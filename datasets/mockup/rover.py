@@ -31,31 +31,38 @@ STEP_TURN = math.radians(2.5)
 
 
 class RoverParams(Params):
-    """The simulated rover: where it starts and how well it drives. All of it is unknown to the estimates."""
+    """The simulated rover: where it starts and how well it drives. All of it is unknown to the estimates.
 
-    seed: int = Field(1, ge=0, description="seed of slip, heading errors and sensors; the bed has its own")
-    slip: float = Field(
-        0.05, ge=-0.5, lt=1, description="share of the wheels' turning that yields no motion; sand: 0.05 to 0.2"
-    )
-    slip_sigma: float = Field(0.03, ge=0, lt=0.5, description="standard deviation of the slip from leg to leg")
-    heading_sigma_deg: float = Field(
-        1.0, ge=0, le=20, description="standard deviation of the heading's drift on a leg [degrees]"
-    )
-    turn_sigma: float = Field(0.03, ge=0, le=0.5, description="relative standard deviation of turns on the spot")
-    frame_step: float = Field(0.025, gt=0.001, description="longest distance between two images [m]")
-    pad: float = Field(
-        0.28, ge=0, description="radius [m] of the start area: plane, as steep as the bed, known to the rover"
-    )
-    map_cell: float | None = Field(None, gt=0.004, description="cell [m] of a coarse map of the bed; not set: no map")
-    blank: tuple[float, float, float] | None = Field(
-        None, description="x, y, radius [m] of a patch of the bed without any texture; not set: no such patch"
-    )
-    lost_frames: tuple[int, ...] = Field((), description="numbers of the frames whose images are black")
-    obstacle_leg: int | None = Field(
-        None, ge=0, description="leg on which an obstacle appears after its ground was mapped; not set: no obstacle"
-    )
-    obstacle_ahead: float = Field(0.2, gt=0, description="distance [m] of the obstacle along the leg")
-    obstacle_aside: float = Field(0.0, description="distance of the obstacle to the right of the leg [m]")
+    Attributes
+    ----------
+    seed : seed of slip, heading errors and sensors; the bed has its own.
+    slip : share of the wheels' turning that yields no motion; sand: 0.05 to 0.2.
+    slip_sigma : standard deviation of the slip from leg to leg.
+    heading_sigma_deg : standard deviation of the heading's drift on a leg [degrees].
+    turn_sigma : relative standard deviation of turns on the spot.
+    frame_step : longest distance between two images [m].
+    pad : radius [m] of the start area: plane, as steep as the bed, known to the rover.
+    map_cell : cell [m] of a coarse map of the bed; not set: no map.
+    blank : x, y, radius [m] of a patch of the bed without any texture; not set: no such patch.
+    lost_frames : numbers of the frames whose images are black.
+    obstacle_leg : leg on which an obstacle appears after its ground was mapped; not set: no obstacle.
+    obstacle_ahead : distance [m] of the obstacle along the leg.
+    obstacle_aside : distance of the obstacle to the right of the leg [m].
+    """
+
+    seed: int = Field(1, ge=0)
+    slip: float = Field(0.05, ge=-0.5, lt=1)
+    slip_sigma: float = Field(0.03, ge=0, lt=0.5)
+    heading_sigma_deg: float = Field(1.0, ge=0, le=20)
+    turn_sigma: float = Field(0.03, ge=0, le=0.5)
+    frame_step: float = Field(0.025, gt=0.001)
+    pad: float = Field(0.28, ge=0)
+    map_cell: float | None = Field(None, gt=0.004)
+    blank: tuple[float, float, float] | None = None
+    lost_frames: tuple[int, ...] = ()
+    obstacle_leg: int | None = Field(None, ge=0)
+    obstacle_ahead: float = Field(0.2, gt=0)
+    obstacle_aside: float = 0.0
 
 
 class RoverPose(NamedTuple):

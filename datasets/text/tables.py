@@ -15,14 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.text.count import count
 from rille.datasets.text.reading import GREATEST, SAMPLE, read_lines
 from rille.datasets.text.times import undated
 from rille.datasets.text.units import OPERATOR, UNITS, unit_of
-from rille.datasets.text.warning import warning
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
+from rille.stages.core.quantities import count
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
 STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")

@@ -67,10 +67,10 @@ def page(chosen: Mapping[str, Params]) -> Iterator[str]:
 
 def rows(values: Params) -> Iterator[tuple[str, str, str, str]]:
     """Key, default as TOML, permitted values, and meaning of each parameter of a section."""
+    meanings = values.meanings()
     for key, value in values.model_dump(mode="json").items():
-        field = type(values).model_fields[key]
         default = "not set" if value is None else tomli_w.dumps({key: value}, indent=0).partition("=")[2].strip()
-        yield key, " ".join(default.split()), _permitted(field), " ".join((field.description or "").split())
+        yield key, " ".join(default.split()), _permitted(type(values).model_fields[key]), meanings.get(key, "")
 
 
 def _permitted(field: FieldInfo) -> str:

@@ -41,7 +41,6 @@ from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
 from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import Outcome, code_changed
 from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
@@ -305,7 +304,9 @@ class _Run:
             self.largest = needs
             if self.workers is not None:
                 self.workers.scale(self.budget.workers(needs))
-        given, force = map_ports(_given, handle.inputs), handle.stage in self.force
+        # An input is its artifact without the facts, which the task reads, or the number of the call that makes it.
+        given = map_ports(lambda h: h.index if h.ref is None else without_facts(h.ref), handle.inputs)
+        force = handle.stage in self.force
         self.calls.append(Call(handle.index, self.store.root, handle.spec, given, handle.key, force))
         self.in_flight[handle.index] = handle
 
@@ -484,12 +485,6 @@ class _Run:
             self.result.unknown += [h.label for h in missing]
             status = "planned" if self.dry else "skipped"
             self.ledger.note(f"plan after {_labels(waiting.handles)}", status, _labels(missing))
-
-
-def _given(handle: Handle) -> Ref | int:
-    """An input as it is handed over: its artifact without the facts, which the task reads, or the number of the call
-    that makes it."""
-    return handle.index if handle.ref is None else without_facts(handle.ref)
 
 
 def _labels(handles: list[Handle]) -> str:

@@ -22,7 +22,6 @@ import os
 import pickle
 import queue
 import re
-import sys
 import time
 import traceback
 import uuid
@@ -150,9 +149,6 @@ def check(kind: Any, jobs: int | None = None) -> None:
     if kind == "dask" and (where := _unguarded()):
         text = f"{where} runs whenever the program is imported, which each worker does that starts"
         raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
-    main = sys.modules["__main__"]
-    if kind == "dask" and not os.path.exists(getattr(main, "__file__", None) or __file__):
-        del main.__file__  # <stdin> of `python -`: a worker that starts would read it
     # One of multiprocessing's pools, or of another cluster of dask: Python lets no daemon start processes.
     if kind == "dask" and multiprocessing.current_process().daemon:
         text = "a process of a pool, or a worker of dask, cannot start workers"

@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.text.reading import TABLE, Search, open_regular, read_lines, read_text
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine.memory import free, words
 from rille.pipeline.export.writers import ENGINEERING_CRS
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 from rille.stages.terrain.relief.grid import Grid
 
 MAX_CELLS = 500_000_000

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from rille.pipeline.engine.graph import Handle, Wait, done
+from rille.pipeline.engine.graph import Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair
 from rille.stages.evaluation.accuracy import accuracy_stage
@@ -64,31 +64,33 @@ def of_pair(make: Builder, pair: Pair) -> Flow:
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )
-    if make.sequence.truth_dem is None or _truth(make, pair.frame) is None or not make.graph.asks_for("dem_accuracy"):
+    exact, T_truth_left = make.sequence.truth_dem, _truth(make, pair.frame)
+    if exact is None or T_truth_left is None or not make.graph.asks_for("dem_accuracy"):
         return
     level, dem = (yield from done(pair.level)), (yield from done(pair.dem))
-    exact = _truth_dem(make, Lattice.from_dict(dem.meta["lattice"]), pair.frame, level, (pair.frame,), "local")
+    source = exact(dem.meta["lattice"], _levelled(T_truth_left, level), (pair.frame,))
     window = make.sequence.evaluation_window
     make.products.local_dem_accuracy[pair.frame] = make.node(
         dem_accuracy_stage,
         f"dem_accuracy/local/{pair.frame}",
         dem=[pair.dem],
-        truth=exact,
+        truth=make.source(source, f"truth_dem/local/{pair.frame}"),
         window=None if window is None else list(window),
     )
 
 
 def of_world(make: Builder, pairs: Sequence[Pair]) -> Flow:
     """Compare the merged elevation model with the truth; judge the path by the hazards of the exact model."""
-    p, first = make.products, pairs[0]
-    if make.sequence.truth_dem is None or _truth(make, first.frame) is None:
+    p, first, exact = make.products, pairs[0], make.sequence.truth_dem
+    if exact is None or (T_truth_left := _truth(make, first.frame)) is None:
         return
     level = yield from done(first.level)
     whole = union(Lattice.from_dict(tile.spec.args["lattice"]) for tile in p.world_tiles)
-    exact = _truth_dem(make, whole, first.frame, level, tuple(pair.frame for pair in pairs), "world")
-    p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=exact)
+    source = exact(whole.to_dict(), _levelled(T_truth_left, level), tuple(pair.frame for pair in pairs))
+    true = make.source(source, f"truth_dem/world/{first.frame}")
+    p.dem_accuracy = make.node(dem_accuracy_stage, "dem_accuracy/world", dem=p.world_tiles, truth=true)
     if p.world_path is not None:
-        true_risk = make.hazards("risk/truth", [exact])
+        true_risk = make.hazards("risk/truth", [true])
         p.path_check = make.node(path_check_stage, "path_check", path=p.world_path, risk=true_risk)
 
 
@@ -96,12 +98,6 @@ def _truth(make: Builder, frame: int) -> RigidTransform | None:
     return None if make.sequence.truth is None else make.sequence.truth[frame]
 
 
-def _truth_dem(
-    make: Builder, lattice: Lattice, pair: int, level: Ref[GroundFacts], seen_by: tuple[int, ...], scope: str
-) -> Handle:
-    """Exact elevations in the levelled frame of ``pair`` (for the first pair: the world)."""
-    T_truth_left, exact = _truth(make, pair), make.sequence.truth_dem
-    assert T_truth_left is not None
-    assert exact is not None
-    T_truth_local = T_truth_left @ RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()
-    return make.source(exact(lattice.to_dict(), T_truth_local, seen_by), f"truth_dem/{scope}/{pair}")
+def _levelled(T_truth_left: RigidTransform, level: Ref[GroundFacts]) -> RigidTransform:
+    """Pose in the truth of the levelled frame of a pair (of the first one: the world)."""
+    return T_truth_left @ RigidTransform.from_matrix(level.meta["T_local_left"]).inverse()

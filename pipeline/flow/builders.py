@@ -33,8 +33,8 @@ from rille.stages.imaging.image_quality import image_quality_stage
 from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
-from rille.stages.odometry.resection.intrinsics import calibrated_anew, corrected
-from rille.stages.odometry.resection.pose import pose_stage
+from rille.stages.odometry.pose import pose_stage
+from rille.stages.odometry.resection.calibration_errors import calibrated_anew, corrected
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
 from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage

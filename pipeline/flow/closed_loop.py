@@ -40,7 +40,6 @@ import numpy as np
 from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
-from rille.datasets.text.count import count
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name_graph
@@ -48,6 +47,7 @@ from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError, DegenerateError
+from rille.stages.core.quantities import count
 from rille.stages.driving import obstacle_monitor
 from rille.stages.driving.fault_monitor import fault_monitor_stage
 from rille.stages.driving.obstacle_monitor import obstacle_monitor_stage
@@ -71,42 +71,33 @@ Sigma = Annotated[float, Field(ge=0)]
 
 
 class DriveParams(Params):
-    """Parameters of the loop; those of a stop and of a leg are in the sections of their stages."""
+    """Parameters of the loop; those of a stop and of a leg are in the sections of their stages.
 
-    goal: tuple[float, float] | None = Field(
-        default=None, description="x, y [m] of the goal, in the frame that drive.frame names"
-    )
-    frame: Literal["world", "map"] = Field(
-        default="world",
-        description="frame of the goal; world: its origin is the first left camera; map: the global map, where "
-        "there is one",
-    )
-    prior: tuple[float, float, float] | None = Field(
-        default=None,
-        description="rough pose of the first left camera in the global map: x, y [m], heading [degrees to the left]",
-    )
-    prior_sigma: tuple[Sigma, Sigma] = Field(
-        default=(0.1, 5.0), description="standard deviations of that pose: position [m], heading [degrees]"
-    )
-    pose: tuple[float, float, float, float] | None = Field(
-        default=None,
-        description="known pose of the first left camera in the global map, used instead of a search: x, y, z [m],"
-        " heading [degrees to the left]",
-    )
-    detail: float = Field(
-        default=4.0,
-        ge=0,
-        description="pixels along the range that a wheel's diameter must cover for ground to be driven on: about a"
-        " matching window, which smooths away what is smaller; ground seen from farther serves for planning alone; "
-        "0: no such limit",
-    )
-    around: float = Field(default=0.6, gt=0, description="margin [m] of the map around start and goal")
-    max_stops: int = Field(
-        default=80,
-        ge=1,
-        description="stops after which the drive is given up; a path of 2.8 m among many rocks took more than 60",
-    )
-    max_safety_stops: int = Field(default=3, ge=1, description="successive safety stops that end the drive")
+    Attributes
+    ----------
+    goal : x, y [m] of the goal, in the frame that drive.frame names.
+    frame : frame of the goal; world: its origin is the first left camera; map: the global map, where there is one.
+    prior : rough pose of the first left camera in the global map: x, y [m], heading [degrees to the left].
+    prior_sigma : standard deviations of that pose: position [m], heading [degrees].
+    pose : known pose of the first left camera in the global map, used instead of a search: x, y, z [m], heading
+        [degrees to the left].
+    detail : pixels along the range that a wheel's diameter must cover for ground to be driven on: about a matching
+        window, which smooths away what is smaller; ground seen from farther serves for planning alone; 0: no such
+        limit.
+    around : margin [m] of the map around start and goal.
+    max_stops : stops after which the drive is given up; a path of 2.8 m among many rocks took more than 60.
+    max_safety_stops : successive safety stops that end the drive.
+    """
+
+    goal: tuple[float, float] | None = None
+    frame: Literal["world", "map"] = "world"
+    prior: tuple[float, float, float] | None = None
+    prior_sigma: tuple[Sigma, Sigma] = (0.1, 5.0)
+    pose: tuple[float, float, float, float] | None = None
+    detail: float = Field(4.0, ge=0)
+    around: float = Field(0.6, gt=0)
+    max_stops: int = Field(80, ge=1)
+    max_safety_stops: int = Field(3, ge=1)
 
 
 def arena(goal: tuple[float, float], around: float, cell: float) -> Lattice:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import Field, create_model
+from pydantic import create_model
 
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.validation import Model, validated
@@ -53,19 +53,19 @@ PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 
 class TerrainParams(Params):
-    """One choice for all stages that make elevations."""
+    """One choice for all stages that make elevations.
 
-    preset: Literal["default", "accurate"] = Field(
-        default="default",
-        description="accurate: sets hfvm.preset accurate, locus.both, track.points 2000 and merge.max_std_cells "
-        "0.7; errors are about two fifths smaller, matching takes many times as long; keys set explicitly win",
-    )
-    reference: Literal["ground", "scene"] | tuple[float, float, float, float, float, float] | None = Field(
-        default=None,
-        description="what elevations are measured from: ground; scene: the plane that most of the scene lies on; or "
-        "the plane with a normal x, y, z through a point x, y, z [m] of the left camera's frame (x right, y down, z "
-        "ahead); not set: the ground, or the scene's plane where too little speaks for ground",
-    )
+    Attributes
+    ----------
+    preset : accurate: sets hfvm.preset accurate, locus.both, track.points 2000 and merge.max_std_cells 0.7; errors are
+        about two fifths smaller, matching takes many times as long; keys set explicitly win.
+    reference : what elevations are measured from: ground; scene: the plane that most of the scene lies on; or the plane
+        with a normal x, y, z through a point x, y, z [m] of the left camera's frame (x right, y down, z ahead); not
+        set: the ground, or the scene's plane where too little speaks for ground.
+    """
+
+    preset: Literal["default", "accurate"] = "default"
+    reference: Literal["ground", "scene"] | tuple[float, float, float, float, float, float] | None = None
 
 
 DATASET_SECTIONS = ("mockup", "misalign", "rover")
@@ -214,14 +214,10 @@ def build(*layers: Mapping[str, Any]) -> Params:
     for layer in layers:
         merge(nested, layer)
     for section, preset, values in PRESETS:
-        if _preset(nested, section) == preset:
+        given = nested.get(section)
+        if isinstance(given, Mapping) and given.get("preset") == preset:
             nested = merge(merge({}, values), nested)
     return validate(model(), nested, also=DATASET_SECTIONS)
-
-
-def _preset(nested: Mapping[str, Any], section: str) -> Any:
-    values = nested.get(section)
-    return values.get("preset") if isinstance(values, Mapping) else None
 
 
 def suited(sequence: Sequence) -> dict[str, Any]:
@@ -242,10 +238,8 @@ def to_toml(config: Params, extra: Mapping[str, Params] | None = None) -> str:
 
 
 def _section(name: str, values: Params) -> str:
-    lines = [f"[{name}]"]
+    lines, meanings = [f"[{name}]"], values.meanings()
     for key, value in values.model_dump(mode="json").items():
-        description = type(values).model_fields[key].description
-        if description:
-            lines.append("# " + " ".join(description.split()))
+        lines += [f"# {meanings[key]}"] if key in meanings else []
         lines.append(f"# {key} is not set" if value is None else tomli_w.dumps({key: value}).strip())
     return "\n".join(lines) + "\n"

@@ -32,20 +32,17 @@ SIDE_STEP, MIN_SIDE = 128, 256
 
 
 class Tiling(Params):
-    """When a pair is matched in tiles; 99.9 % of the pixels are within .01 px of the untiled result."""
+    """When a pair is matched in tiles; 99.9 % of the pixels are within .01 px of the untiled result.
 
-    memory: int = Field(
-        default=1000,
-        ge=50,
-        description="memory [MB] that one task of the matcher may take besides the program itself (about 300); "
-        "larger pairs are matched in tiles",
-    )
-    tile: int | None = Field(
-        default=None,
-        ge=0,
-        description="side of a tile [pixels] at every level; 0: pairs of any size are matched whole; not set: "
-        "chosen by memory",
-    )
+    Attributes
+    ----------
+    memory : memory [MB] that one task of the matcher may take besides the program itself (about 300); larger pairs are
+        matched in tiles.
+    tile : side of a tile [pixels] at every level; 0: pairs of any size are matched whole; not set: chosen by memory.
+    """
+
+    memory: int = Field(1000, ge=50)
+    tile: int | None = Field(None, ge=0)
 
 
 def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> int | None:

@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from rille.datasets.text.count import count
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow.products import Products
@@ -20,13 +19,13 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
 from rille.stages.core.declare import Bundle
-from rille.stages.core.quantities import metres, number, quantity
+from rille.stages.core.quantities import count, metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry import rigid
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hfvm.coarse import ImageDifference
-from rille.stages.odometry.resection.intrinsics import CORRECTED
+from rille.stages.odometry.resection.calibration_errors import CORRECTED
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.reference import camera_height, seen_up
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.datasets.text.warning import warning
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.errors import warning
 from rille.stages.core.validity import Validity, has, matched, matched_back
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.imaging import levels

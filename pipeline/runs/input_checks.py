@@ -16,9 +16,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from rille.datasets.protocol import Sequence
-from rille.datasets.text.count import count
 from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.core.arrays import Floats
+from rille.stages.core.quantities import count
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.epipolar import MAX_IMAGE_TURN_DEG
 from rille.stages.geometry.geometry import Rig, RigidTransform

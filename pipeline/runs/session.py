@@ -20,7 +20,6 @@ from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.code_digest import remember
@@ -41,7 +40,7 @@ from rille.pipeline.runs import part_of_run, roots, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
-from rille.stages.core.errors import ConfigError, RilleError, within
+from rille.stages.core.errors import ConfigError, RilleError, warning, within
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:

@@ -25,15 +25,15 @@ from rille.stages.geometry.geometry import Rig
 
 
 class OrientationParams(Params):
-    """Parameters of the stage ``orientation``."""
+    """Parameters of the stage ``orientation``.
 
-    samples: int = Field(
-        1500,
-        ge=100,
-        le=100_000,
-        description="number of image cells; the best match of each is used; 1500: cells of some 20 pixels, whose "
-        "errors are nearly independent",
-    )
+    Attributes
+    ----------
+    samples : number of image cells; the best match of each is used; 1500: cells of some 20 pixels, whose errors are
+        nearly independent.
+    """
+
+    samples: int = Field(1500, ge=100, le=100_000)
 
 
 def thin(column: ArrayLike, row: ArrayLike, usable: Bools, quality: ArrayLike, samples: int) -> tuple[Floats, Floats]:

@@ -62,26 +62,21 @@ MIN_DEPTH_CHANGE = 0.005
 
 
 class RelativeParams(Params):
-    """When a parameter of the rig may depart from the calibration."""
+    """When a parameter of the rig may depart from the calibration.
 
-    significance: float = Field(
-        4.0,
-        ge=1,
-        description="standard deviations, systematic errors included, by which the images must contradict a "
-        "calibrated value to change it; 1 for the other angles once one has changed",
-    )
-    least_rows: float = Field(
-        0.4,
-        ge=0,
-        description="change of row offsets [pixels RMS] from which on a correction is applied; KITTI's calibration is"
-        " good to 0.4",
-    )
-    prior_principal: float = Field(
-        0.005,
-        gt=0,
-        description="standard deviation of the principal point over the focal length; 0.005 is usual for a "
-        "calibration with a target; smaller values make more toe-in observable",
-    )
+    Attributes
+    ----------
+    significance : standard deviations, systematic errors included, by which the images must contradict a calibrated
+        value to change it; 1 for the other angles once one has changed.
+    least_rows : change of row offsets [pixels RMS] from which on a correction is applied; KITTI's calibration is good
+        to 0.4.
+    prior_principal : standard deviation of the principal point over the focal length; 0.005 is usual for a calibration
+        with a target; smaller values make more toe-in observable.
+    """
+
+    significance: float = Field(4.0, ge=1)
+    least_rows: float = Field(0.4, ge=0)
+    prior_principal: float = Field(0.005, gt=0)
 
     def priors(self, rig: Rig) -> Priors:
         """Prior standard deviations of a rig, in radians and pixels."""

@@ -14,7 +14,6 @@ from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import scipy
-from pydantic import Field
 
 from rille.stages.calibration.doubt import MAX_REPEATED_SHARE
 from rille.stages.calibration.lens_reading import better_reading
@@ -54,18 +53,20 @@ from rille.stages.geometry.epipolar import (
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
-from rille.stages.geometry.sides import BeyondInfinityError, refuse_impossible, refuse_mirrored
+from rille.stages.geometry.sides import BeyondInfinityError, exchanged, refuse_impossible, refuse_mirrored
 from rille.stages.numeric.robust import mad_sigma
 
 
 class RigParams(RelativeParams):
-    """Parameters of the stage ``rig``."""
+    """Parameters of the stage ``rig``.
 
-    mode: Literal["pooled", "per_pair", "fixed"] = Field(
-        "pooled",
-        description="pooled: one rig from all pairs; per_pair: a rig for each pair (a rig that bends); fixed: keep "
-        "the given rig, report contradictions only",
-    )
+    Attributes
+    ----------
+    mode : pooled: one rig from all pairs; per_pair: a rig for each pair (a rig that bends); fixed: keep the given rig,
+        report contradictions only.
+    """
+
+    mode: Literal["pooled", "per_pair", "fixed"] = "pooled"
 
 
 def orient_rig(
@@ -134,7 +135,7 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
         refuse_impossible(rig, left, right, share)
     elif applied:
         # The correction that mirrored images ask for may look like a knock.
-        refuse_mirrored(given, left, right)
+        refuse_mirrored(given, left, right, max(exchanged(given, left, right)[1:]))
     weights, of_given, off = np.concatenate(decision.fit.weights), _distances(given, pairs), _distances(rig, pairs)
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))

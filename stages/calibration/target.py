@@ -20,17 +20,14 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry.lens import COEFFICIENTS, Lens
 from rille.stages.geometry.rigid import angle
 from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
-MODELS: Mapping[str, tuple[str, ...]] = {
-    "radtan": ("k1", "k2", "p1", "p2", "k3"),
-    "radtan4": ("k1", "k2", "p1", "p2"),
-    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
+MODELS: Mapping[str, tuple[str, ...]] = {name: keys for name, keys in COEFFICIENTS.items() if keys} | {
+    "radtan4": COEFFICIENTS["radtan"][:4]
 }
-"""Names of the coefficients of each model, in OpenCV's order; radtan4 is radtan without k3."""
+"""Names of the coefficients of each model; radtan4 is radtan without k3."""
 
 LEAST_VIEWS = 3
 """Two views just determine a camera: a bad one would not show."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Concatenate, Generic, ParamSpec, TypedDict, cast, get_args, get_origin, get_type_hints
@@ -31,7 +32,10 @@ M = TypeVar("M", bound="Params")
 
 
 class Params(BaseModel):
-    """Base of all parameter models: frozen, unknown keys refused, no infinities."""
+    """Base of all parameter models: frozen, unknown keys refused, no infinities.
+
+    The docstring of a model says under ``Attributes`` what each parameter means: a change of words changes no key.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
@@ -43,6 +47,13 @@ class Params(BaseModel):
         if isinstance(value, bool) and bool not in (annotation, *get_args(annotation)):
             raise ValueError("input should be a number, no switch")
         return value
+
+    @classmethod
+    def meanings(cls) -> dict[str, str]:
+        """What each parameter means, by name, as the docstrings of the model and of its bases say."""
+        texts = (inspect.cleandoc(base.__doc__ or "") for base in reversed(cls.__mro__))
+        entries = (entry for text in texts for entry in re.findall(r"^(\w+) : (.*(?:\n    .*)*)", text, re.MULTILINE))
+        return {name: " ".join(words.split()) for name, words in entries}
 
 
 class NoParams(Params):
@@ -177,8 +188,7 @@ class Stage(Generic[M, F]):
 
     def __call__(self, *args: Any, **kwargs: Any) -> Bundle[F]:
         """Call the function that was declared."""
-        assert self.function is not None
-        return self.function(*args, **kwargs)
+        return (self.function or self.run)(*args, **kwargs)
 
 
 def stage(
@@ -269,7 +279,7 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
             raise TypeError(f"{stage.name}: array {name!r} is not declared")
         if array.dtype not in (np.dtype(spec.dtype), np.dtype(spec.deep or spec.dtype)) or array.ndim != len(spec.dims):
             raise TypeError(f"{stage.name}: {name} is {array.dtype} {array.ndim}-D, declared {spec.dtype} {spec.dims}")
-    missing = missing_outputs(stage, list(bundle.arrays))
+    missing = [a.name for a in stage.outputs if not a.optional and not any(map(a.matches, bundle.arrays))]
     if missing:
         raise TypeError(f"{stage.name}: declared arrays are missing: {', '.join(missing)}")
     if stage.facts is not None:
@@ -277,8 +287,3 @@ def check_outputs(stage: Stage, bundle: Bundle) -> None:
         if not required <= bundle.meta.keys() <= required | optional:
             missing, unknown = sorted(required - bundle.meta.keys()), sorted(bundle.meta.keys() - required - optional)
             raise TypeError(f"{stage.name}: facts that are missing: {missing}, that are not declared: {unknown}")
-
-
-def missing_outputs(stage: Stage, names: Sequence[str]) -> list[str]:
-    """Declared, not optional arrays that ``names`` lacks."""
-    return [a.name for a in stage.outputs if not a.optional and not any(a.matches(n) for n in names)]

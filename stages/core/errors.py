@@ -1,4 +1,4 @@
-"""Errors that a user can act on: each says what is wrong, where, and what to change."""
+"""Errors and warnings that a user can act on: each says what is wrong, where, and what to change."""
 
 from __future__ import annotations
 
@@ -70,6 +70,17 @@ class IncompleteError(InputError):
 
 class DegenerateError(RilleError, ArithmeticError):
     """The data do not determine the answer (too few landmarks, no texture, no baseline ...)."""
+
+
+def warning(code: str, text: str) -> str:
+    """Format a warning as one line: the code of the message, then ``text``.
+
+    ``text`` states the problem, with its value and where it is (file, camera or frame).
+
+    >>> warning("RIL-680", "cam0: 2 images are not there")
+    'RIL-680: cam0: 2 images are not there'
+    """
+    return f"{code}: {text}"
 
 
 def told(complaints: Sequence[Any], words: Callable[[Any], str] = str) -> str:

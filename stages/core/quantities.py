@@ -23,6 +23,11 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
+def count(n: int, what: str) -> str:
+    """``1 task``, ``3 tasks``."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
 def quantity(value: Any, unit: str) -> str:
     """Value with its unit, small lengths and areas in mm and cm²; a dash where there is none (None, NaN)."""
     if value is None or value != value:

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Params, stage
@@ -43,9 +42,14 @@ MIN_POINTS, MIN_SHARE = 8, 0.35
 
 
 class ObstacleMonitorParams(Params):
-    """Parameters of the stage ``obstacle_monitor``."""
+    """Parameters of the stage ``obstacle_monitor``.
 
-    enabled: bool = Field(True, description="whether the rover looks for obstacles between stops")
+    Attributes
+    ----------
+    enabled : whether the rover looks for obstacles between stops.
+    """
+
+    enabled: bool = True
 
 
 @dataclass(frozen=True)

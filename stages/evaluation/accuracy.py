@@ -206,7 +206,7 @@ def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
     version=8,
     outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
-        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, first poses equal", "nan", "world"),
+        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, laid on it", "nan", "world"),
     ],
 )
 def accuracy_stage(

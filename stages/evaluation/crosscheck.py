@@ -42,10 +42,16 @@ Verified = dict[tuple[int, int], NDArray[np.uint32]]
 
 
 class CrosscheckParams(Params):
-    """Parameters of the second opinion on the trajectory."""
+    """Parameters of the second opinion on the trajectory.
 
-    enabled: bool = Field(True, description="compute the trajectory with COLMAP as well, and compare")
-    window: int = Field(20, gt=OVERLAP, description="frames per bundle adjustment; larger: fewer and longer tasks")
+    Attributes
+    ----------
+    enabled : compute the trajectory with COLMAP as well, and compare.
+    window : frames per bundle adjustment; larger: fewer and longer tasks.
+    """
+
+    enabled: bool = True
+    window: int = Field(20, gt=OVERLAP)
 
 
 def windows(frames: Sequence[int], params: CrosscheckParams) -> list[list[int]]:

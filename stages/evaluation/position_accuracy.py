@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.declare import Array, Bundle, NoParams, stage
-from rille.stages.evaluation.accuracy import counts, over_length
+from rille.stages.core.declare import Bundle, NoParams, stage
+from rille.stages.evaluation.accuracy import accuracy_stage, counts, over_length
 from rille.stages.evaluation.reading.clock import MIN_FRAMES, Offset, TruePositions, find_offset
 from rille.stages.evaluation.reading.conventions import MUCH, UNITS
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
@@ -180,14 +180,7 @@ def _clock(offset: Offset) -> dict[str, Metric]:
     }
 
 
-@stage(
-    "position_accuracy",
-    version=2,
-    outputs=[
-        Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
-        Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, moved in the plane", "nan", "world"),
-    ],
-)
+@stage("position_accuracy", version=2, outputs=accuracy_stage.outputs)
 def position_accuracy_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],

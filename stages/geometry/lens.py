@@ -41,6 +41,14 @@ COUNTS: Mapping[str, tuple[int, ...]] = {
 }
 """Numbers of coefficients that each model may have."""
 
+COEFFICIENTS: Mapping[str, tuple[str, ...]] = {
+    "none": (),
+    "radtan": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+"""Usual names of the coefficients of a model, in its order."""
+
 CHUNK_POINTS = 65536
 """Points at a time: OpenCV's projection also writes its Jacobian, 30 numbers a point."""
 

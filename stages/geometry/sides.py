@@ -37,13 +37,14 @@ def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float
     return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
 
 
-def refuse_mirrored(rig: Rig, left: Floats, right: Floats) -> None:
+def refuse_mirrored(rig: Rig, left: Floats, right: Floats, fitting: float) -> None:
     """Refuse matches that fit the rig only once the images of both cameras are mirrored top to bottom.
 
-    If baseline and axes lie in one plane, nothing shows it.
+    ``fitting`` is the share that fits it as given, or exchanged. If baseline and axes lie in one plane, nothing shows
+    it.
     """
     back = [points * [1.0, -1.0] + [0.0, of.height - 1.0] for of, points in ((rig.left, left), (rig.right, right))]
-    if max(exchanged(rig, left, right)[1:]) < 0.4 and fits(rig, back[0], back[1]) > 0.8:
+    if fitting < 0.4 and fits(rig, back[0], back[1]) > 0.8:
         text = "the matches fit the rig only once the images of both cameras are mirrored top to bottom"
         raise DegenerateError("RIL-684", text, remedy="mirror them back")
 
@@ -54,8 +55,8 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
     With sides swapped, matches of parallel cameras lie beyond infinity, those of others on wrong lines. Where all of
     them lie there alike, they may as well show a sky through a camera that is turned.
     """
-    refuse_mirrored(rig, left, right)
     swapped, as_given, other_way = exchanged(rig, left, right)
+    refuse_mirrored(rig, left, right, max(as_given, other_way))
     low, middle, high = np.quantile(beyond_infinity(rig, left, right), (0.25, 0.5, 0.75))
     if (swapped or beyond > 0.5) and middle > 0 and high - low < MAX_LINE_DISTANCE_PX * right_pixels(rig):
         raise DegenerateError(

@@ -58,41 +58,24 @@ NO_BITS = np.uint16(0)
 
 
 class RiskParams(Params):
-    """Parameters of ``risk``; the limits themselves are the vehicle's."""
+    """Parameters of ``risk``; the limits themselves are the vehicle's.
 
-    window: float = Field(
-        default=1.0,
-        gt=0,
-        le=20,
-        description="side of the window [wheel diameters] in which terrain is judged; a wheel bridges what is finer",
-    )
-    sigmas: float = Field(
-        default=1.25,
-        ge=0,
-        le=10,
-        description="number of standard deviations added to a measure before it is compared with its limit",
-    )
-    caution: float = Field(
-        default=0.75,
-        gt=0,
-        le=1,
-        description="share of a limit from which a cell is caution ground; 0.75 is the usual reserve",
-    )
-    max_p: float = Field(
-        default=0.02, gt=0, lt=0.5, description="probability of a hazard from which a cell is caution ground"
-    )
-    min_known: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description="smallest known share of the window; below it a cell is unknown; 0.5 is a straight border",
-    )
-    max_hole: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="widest hole [wheel diameters] that is closed; over 0.5 a wheel sinks by 0.07 diameters",
-    )
+    Attributes
+    ----------
+    window : side of the window [wheel diameters] in which terrain is judged; a wheel bridges what is finer.
+    sigmas : number of standard deviations added to a measure before it is compared with its limit.
+    caution : share of a limit from which a cell is caution ground; 0.75 is the usual reserve.
+    max_p : probability of a hazard from which a cell is caution ground.
+    min_known : smallest known share of the window; below it a cell is unknown; 0.5 is a straight border.
+    max_hole : widest hole [wheel diameters] that is closed; over 0.5 a wheel sinks by 0.07 diameters.
+    """
+
+    window: float = Field(1.0, gt=0, le=20)
+    sigmas: float = Field(1.25, ge=0, le=10)
+    caution: float = Field(0.75, gt=0, le=1)
+    max_p: float = Field(0.02, gt=0, lt=0.5)
+    min_known: float = Field(0.5, gt=0, le=1)
+    max_hole: float = Field(0.5, ge=0, le=1)
 
 
 class Verdicts(NamedTuple):

@@ -12,37 +12,30 @@ class Vehicle(Params):
 
     The defaults are a full-scale small rover of about 60 kg: what a 0.3 m wheel and a passive rocker climb at half of
     their reach, so that they hold on loose ground too.
+
+    Attributes
+    ----------
+    name : name of the vehicle in the report.
+    wheel_diameter : diameter of a wheel [m]; side of the window in which terrain is judged, since a wheel bridges what
+        is finer.
+    track : distance between the left and the right wheels [m].
+    wheel_base : distance between the front and the rear wheels [m].
+    clearance : height of the belly above flat ground [m].
+    max_slope_deg : steepest ground that it drives on [degrees]; half of a usual tip-over angle.
+    max_step : highest edge that it climbs [m]; 0.4 of the wheel diameter.
+    max_roughness : largest roughness [m]: RMS deviation of heights a quarter of a wheel apart; a third of the step.
+    margin : distance that a path keeps from hazards [m]; half a wheel, for errors of localisation.
     """
 
-    name: str = Field(default="default rover", min_length=1, description="name of the vehicle in the report")
-    wheel_diameter: float = Field(
-        default=0.30,
-        gt=0,
-        description="diameter of a wheel [m]; side of the window in which terrain is judged, since a wheel bridges "
-        "what is finer",
-    )
-    track: float = Field(default=0.60, gt=0, description="distance between the left and the right wheels [m]")
-    wheel_base: float = Field(default=0.70, gt=0, description="distance between the front and the rear wheels [m]")
-    clearance: float = Field(default=0.20, gt=0, description="height of the belly above flat ground [m]")
-    max_slope_deg: float = Field(
-        default=20.0,
-        gt=0,
-        lt=90,
-        description="steepest ground that it drives on [degrees]; half of a usual tip-over angle",
-    )
-    max_step: float = Field(
-        default=0.12, gt=0, description="highest edge that it climbs [m]; 0.4 of the wheel diameter"
-    )
-    max_roughness: float = Field(
-        default=0.04,
-        gt=0,
-        description="largest roughness [m]: RMS deviation of heights a quarter of a wheel apart; a third of the step",
-    )
-    margin: float = Field(
-        default=0.15,
-        ge=0,
-        description="distance that a path keeps from hazards [m]; half a wheel, for errors of localisation",
-    )
+    name: str = Field("default rover", min_length=1)
+    wheel_diameter: float = Field(0.30, gt=0)
+    track: float = Field(0.60, gt=0)
+    wheel_base: float = Field(0.70, gt=0)
+    clearance: float = Field(0.20, gt=0)
+    max_slope_deg: float = Field(20.0, gt=0, lt=90)
+    max_step: float = Field(0.12, gt=0)
+    max_roughness: float = Field(0.04, gt=0)
+    margin: float = Field(0.15, ge=0)
 
     @property
     def wheel_width(self) -> float:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import asdict, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,8 +27,9 @@ from rille.stages.hfvm import finest, matcher, refinement
 from rille.stages.hfvm.brightness import MIN_LOG_RATIO, greatest, levelled, ratio_of_matches
 from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.hfvm.finest import Ending, FinestWork, lands
-from rille.stages.hfvm.image import Shape, as_matched, thinned
+from rille.stages.hfvm.image import Shape, as_matched
 from rille.stages.hfvm.level import FREE_BAND, NEAR_SIGN, PyramidPair, State, one_way
+from rille.stages.hfvm.map_reading import better_reading
 from rille.stages.hfvm.native.problem import Map
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS, facts
@@ -42,34 +42,6 @@ matcher's quality it is 0.8."""
 MIN_OWN, MIN_BETTER = 0.6, 1.3
 """The same share below which a map may be the right image's; and times it that must be borne out if it is. Of five of
 Middlebury's pairs .14 to .52 of the right image's map are, .45 to .90 of the left one's."""
-
-FACTORS = (-1.0, 0.5, 2.0, 1.0 / 16, 16.0, 1.0 / 256, 256.0)
-"""Factors of the values of wrong maps: the sign, images of another size, counts of SGBM, counts of KITTI's PNG."""
-
-
-def better_reading(left: AnyArray, right: AnyArray, column: AnyArray) -> str:
-    """How given column displacements (row, col) fit two grey images that they do not fit as they are; empty: no way."""
-    readings = {f"their values times {factor:g}": column * np.float32(factor) for factor in FACTORS}
-    readings["their rows in reverse"] = column[::-1]
-    differences = {name: _difference(left, right, u) for name, u in readings.items()}
-    name, least = min(differences.items(), key=lambda item: item[1])
-    # Half of it: by chance no reading is so much better.
-    return name if least < 0.5 * _difference(left, right, column) else ""
-
-
-def _difference(left: AnyArray, right: AnyArray, column: AnyArray) -> float:
-    """Median difference, grey values, of the right image's pixels at the ends of displacements from the left ones."""
-    # At most as many as cv2.remap takes in a row.
-    y, x = thinned(np.isfinite(column), 10_000)
-    if not len(y):
-        return 255.0
-    end = x + column[y, x]
-    inside = (end >= 0) & (end <= right.shape[1] - 1)
-    # Values that lead out of most of the image are of another unit.
-    if inside.mean() < 0.5:
-        return 255.0
-    there = cv2.remap(right, end[None].astype(np.float32), y[None].astype(np.float32), cv2.INTER_LINEAR)[0]
-    return float(np.median(np.abs(there - left[y, x])[inside]))
 
 
 def of_right_image(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams, own: float) -> bool:

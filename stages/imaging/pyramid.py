@@ -25,14 +25,16 @@ from rille.stages.imaging import noise
 
 
 class PyramidParams(Params):
-    """Parameters of the image pyramid."""
+    """Parameters of the image pyramid.
 
-    levels: int = Field(
-        default=6, ge=1, le=10, description="number of images, level 0 included; three are too few beyond a megapixel"
-    )
-    min_side: int = Field(
-        default=8, ge=1, description="shortest side of a level [pixels]; features of 13 taps need context"
-    )
+    Attributes
+    ----------
+    levels : number of images, level 0 included; three are too few beyond a megapixel.
+    min_side : shortest side of a level [pixels]; features of 13 taps need context.
+    """
+
+    levels: int = Field(6, ge=1, le=10)
+    min_side: int = Field(8, ge=1)
 
 
 MIN_VALID = 3

@@ -44,27 +44,21 @@ a frame are not of one time. A best share below it is that of a wrong rig, and t
 
 
 class FrameScreeningParams(Params):
-    """When a frame counts as lost, or as unfit to be basic."""
+    """When a frame counts as lost, or as unfit to be basic.
 
-    uniform: float = Field(
-        1.0,
-        ge=0,
-        description="standard deviation [grey levels] over an image below which the frame counts as blank; image "
-        "noise has about 1",
-    )
-    blurred: float = Field(
-        0.6,
-        ge=0,
-        le=1,
-        description="share of the camera's usual sharpness below which a pair cannot be a basic pair; a Gaussian blur"
-        " of one pixel costs 0.4",
-    )
-    jump: float = Field(
-        4.0,
-        gt=0,
-        description="change of the displacements between two steps, both in pixels and in multiples of the lower "
-        "quartile, from which on the frames there are tested for images that are swapped or not of one time",
-    )
+    Attributes
+    ----------
+    uniform : standard deviation [grey levels] over an image below which the frame counts as blank; image noise has
+        about 1.
+    blurred : share of the camera's usual sharpness below which a pair cannot be a basic pair; a Gaussian blur of one
+        pixel costs 0.4.
+    jump : change of the displacements between two steps, both in pixels and in multiples of the lower quartile, from
+        which on the frames there are tested for images that are swapped or not of one time.
+    """
+
+    uniform: float = Field(1.0, ge=0)
+    blurred: float = Field(0.6, ge=0, le=1)
+    jump: float = Field(4.0, gt=0)
 
 
 @dataclass

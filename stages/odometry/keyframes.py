@@ -26,37 +26,27 @@ NAVIGATION: Mapping[str, Any] = {"rule": "overlap", "overlap": 0.6}
 
 
 class KeyframesParams(Params):
-    """Parameters of the choice of basic pairs."""
+    """Parameters of the choice of basic pairs.
 
-    preset: Literal["terrain", "navigation"] = Field(
-        "terrain",
-        description="terrain: close basic pairs, whose elevation models overlap; navigation: trajectory only, with "
-        "rule overlap at 0.6, hfvm.preset fast, and cheaper motion.level, track.points and "
-        "orientation.samples; keys set explicitly win, except keyframes.stride without keyframes.rule",
-    )
-    rule: Literal["overlap", "stride"] = Field(
-        "overlap",
-        description="overlap: basic pairs as far apart as keyframes.overlap permits; stride: every stride-th frame, as "
-        "in the paper",
-    )
-    overlap: float = Field(
-        0.7,
-        gt=0,
-        lt=1,
-        description="share of a basic pair's view that the next basic pair must see too (rule overlap); with less, "
-        "landmarks and common terrain run out",
-    )
-    stride: int = Field(
-        4,
-        ge=1,
-        description="frames between basic pairs (rule stride; 4 in the paper, section 7.4); setting it without "
-        "keyframes.rule selects rule stride",
-    )
-    max_gap: int = Field(
-        16,
-        ge=1,
-        description="largest number of frames between basic pairs under rule overlap; light and shadows change",
-    )
+    Attributes
+    ----------
+    preset : terrain: close basic pairs, whose elevation models overlap; navigation: trajectory only, with rule overlap
+        at 0.6, hfvm.preset fast, and cheaper motion.level, track.points and orientation.samples; keys set explicitly
+        win, except keyframes.stride without keyframes.rule.
+    rule : overlap: basic pairs as far apart as keyframes.overlap permits; stride: every stride-th frame, as in the
+        paper.
+    overlap : share of a basic pair's view that the next basic pair must see too (rule overlap); with less, landmarks
+        and common terrain run out.
+    stride : frames between basic pairs (rule stride; 4 in the paper, section 7.4); setting it without keyframes.rule
+        selects rule stride.
+    max_gap : largest number of frames between basic pairs under rule overlap; light and shadows change.
+    """
+
+    preset: Literal["terrain", "navigation"] = "terrain"
+    rule: Literal["overlap", "stride"] = "overlap"
+    overlap: float = Field(0.7, gt=0, lt=1)
+    stride: int = Field(4, ge=1)
+    max_gap: int = Field(16, ge=1)
 
     @model_validator(mode="before")
     @classmethod

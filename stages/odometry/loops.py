@@ -31,12 +31,16 @@ CANDIDATES = 6
 
 
 class LoopsParams(Params):
-    """Parameters of places that are seen again."""
+    """Parameters of places that are seen again.
 
-    enabled: bool = Field(True, description="look for places that are seen again, and adjust all poses to them")
-    apart: int = Field(
-        10, ge=2, description="number of basic pairs from which on a place counts as seen again, not as still in view"
-    )
+    Attributes
+    ----------
+    enabled : look for places that are seen again, and adjust all poses to them.
+    apart : number of basic pairs from which on a place counts as seen again, not as still in view.
+    """
+
+    enabled: bool = True
+    apart: int = Field(10, ge=2)
 
 
 def words(descriptors: AnyArray) -> NDArray[np.int32]:

@@ -31,27 +31,21 @@ from rille.stages.odometry.displacements import Motion, common_similarity
 
 
 class MotionParams(Params):
-    """Parameters of the coarse displacements between successive frames."""
+    """Parameters of the coarse displacements between successive frames.
 
-    level: int = Field(
-        default=2, ge=0, le=6, description="pyramid level of the displacement map; 2: a quarter of the resolution"
-    )
-    top_columns: float = Field(
-        default=0.25,
-        gt=0,
-        le=1,
-        description="share of the image width searched to either side at the top pyramid level",
-    )
-    top_rows: float = Field(
-        default=0.25, gt=0, le=1, description="share of the image height searched up and down at the top pyramid level"
-    )
-    turn_below: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="if fewer than this share of the textured pixels match, undo a homography fitted to features and "
-        "match again; an upright window matches 3/4 of a street scene and 1/3 when turned by 30 degrees; 0: never",
-    )
+    Attributes
+    ----------
+    level : pyramid level of the displacement map; 2: a quarter of the resolution.
+    top_columns : share of the image width searched to either side at the top pyramid level.
+    top_rows : share of the image height searched up and down at the top pyramid level.
+    turn_below : if fewer than this share of the textured pixels match, undo a homography fitted to features and match
+        again; an upright window matches 3/4 of a street scene and 1/3 when turned by 30 degrees; 0: never.
+    """
+
+    level: int = Field(2, ge=0, le=6)
+    top_columns: float = Field(0.25, gt=0, le=1)
+    top_rows: float = Field(0.25, gt=0, le=1)
+    turn_below: float = Field(0.5, ge=0, le=1)
 
 
 SMOOTHNESS, ROUNDS = 5, 6

@@ -41,20 +41,18 @@ MAX_RETURN_PX = 0.5
 
 
 class TrackParams(Params):
-    """Parameters of the stage ``track``."""
+    """Parameters of the stage ``track``.
 
-    points: int = Field(
-        400,
-        ge=6,
-        description="interest points of the key frame (paper: about 200); the pose error falls with the square root "
-        "of their number",
-    )
-    noise: float = Field(
-        1.5,
-        gt=0,
-        description="grey value noise [grey levels] of one image; patches whose contrast is below three times its "
-        "effect get no point; where hardly one gets any, the noise that the image has, if it is less",
-    )
+    Attributes
+    ----------
+    points : interest points of the key frame (paper: about 200); the pose error falls with the square root of their
+        number.
+    noise : grey value noise [grey levels] of one image; patches whose contrast is below three times its effect get no
+        point; where hardly one gets any, the noise that the image has, if it is less.
+    """
+
+    points: int = Field(400, ge=6)
+    noise: float = Field(1.5, gt=0)
 
 
 @dataclass

@@ -37,47 +37,31 @@ Planner = Literal["rows", "grid8", "auto"]
 
 
 class PathParams(Params):
-    """Parameters of ``path``. ``start`` and ``target`` concern the path over the whole map, not those of each stop."""
+    """Parameters of ``path``. ``start`` and ``target`` concern the path over the whole map, not those of each stop.
 
-    start: Point | None = Field(
-        default=None,
-        description="start x, y, world frame [m]; not set: within a vehicle's length of the first row, or where the "
-        "rig began, if that is farther up the map",
-    )
-    target: Point | None = Field(
-        default=None, description="target x, y, world frame [m]; not set: as far as rows or connected ground lead"
-    )
-    planner: Planner = Field(
-        default="auto",
-        description="rows: one step ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows "
-        "do not reach the target, or do not cross the map",
-    )
-    detour_cost: float = Field(
-        default=0.2,
-        ge=0,
-        le=10,
-        description="cost of a metre by which planner rows departs from straight ahead [m of climb]; 0: heights alone "
-        "count, as in the paper; 0.2: about the rolling resistance of loose ground; grid8 counts its length as climb",
-    )
-    caution_cost: float = Field(
-        default=0.2,
-        ge=0,
-        le=10,
-        description="cost of a metre of caution ground [m of climb]; 0.2: worth a detour of a fifth",
-    )
-    uncertainty_cost: float = Field(
-        default=5.0,
-        ge=0,
-        le=1000,
-        description="cost of a metre [m of climb], times its probability of a hazard; 5: at 0.1 worth a detour of half",
-    )
-    p_certain_hazard: float = Field(
-        default=0.1,
-        gt=0,
-        le=1,
-        description="probability of a hazard from which ground is closed, though no measure exceeds its limit by "
-        "enough standard deviations; where this alone closes all paths, the reason says so",
-    )
+    Attributes
+    ----------
+    start : start x, y, world frame [m]; not set: within a vehicle's length of the first row, or where the rig began, if
+        that is farther up the map.
+    target : target x, y, world frame [m]; not set: as far as rows or connected ground lead.
+    planner : rows: one step ahead in every row, as in the paper; grid8: any direction; auto: grid8 where rows do not
+        reach the target, or do not cross the map.
+    detour_cost : cost of a metre by which planner rows departs from straight ahead [m of climb]; 0: heights alone
+        count, as in the paper; 0.2: about the rolling resistance of loose ground; grid8 counts its length as climb.
+    caution_cost : cost of a metre of caution ground [m of climb]; 0.2: worth a detour of a fifth.
+    uncertainty_cost : cost of a metre [m of climb], times its probability of a hazard; 5: at 0.1 worth a detour of
+        half.
+    p_certain_hazard : probability of a hazard from which ground is closed, though no measure exceeds its limit by
+        enough standard deviations; where this alone closes all paths, the reason says so.
+    """
+
+    start: Point | None = None
+    target: Point | None = None
+    planner: Planner = "auto"
+    detour_cost: float = Field(0.2, ge=0, le=10)
+    caution_cost: float = Field(0.2, ge=0, le=10)
+    uncertainty_cost: float = Field(5.0, ge=0, le=1000)
+    p_certain_hazard: float = Field(0.1, gt=0, le=1)
 
 
 def cell_of(lattice: Lattice, point: Sequence[float] | Floats) -> Cell:

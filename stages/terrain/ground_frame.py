@@ -67,12 +67,16 @@ MIN_DOMINANT_SHARE = 0.3  # of the matches, from which a plane may be the refere
 
 
 class GroundFrameParams(Params):
-    """Parameters of the stage ``ground_frame``."""
+    """Parameters of the stage ``ground_frame``.
 
-    reference_height: float | None = Field(
-        None, gt=0, description="depth [m] of a plane below the camera that stands for ground which is not seen"
-    )
-    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a disparity [pixels]")
+    Attributes
+    ----------
+    reference_height : depth [m] of a plane below the camera that stands for ground which is not seen.
+    sigma_disparity : standard deviation of a disparity [pixels].
+    """
+
+    reference_height: float | None = Field(None, gt=0)
+    sigma_disparity: float = Field(0.2, gt=0)
 
 
 class VerticalHint(NamedTuple):

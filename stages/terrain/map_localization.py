@@ -55,13 +55,18 @@ right places, .51 at most in the map of another bed."""
 
 
 class MapLocalizationParams(Params):
-    """Parameters of the stage ``map_localization``."""
+    """Parameters of the stage ``map_localization``.
 
-    reach: float = Field(3.0, gt=0, description="search range to either side of the prior [its standard deviations]")
-    sigma_tilt_deg: float = Field(
-        0.5, gt=0, description="standard deviation of the model's vertical about each axis [degrees]"
-    )
-    min_overlap: float = Field(0.5, gt=0, le=1, description="least share of the local model that the global map covers")
+    Attributes
+    ----------
+    reach : search range to either side of the prior [its standard deviations].
+    sigma_tilt_deg : standard deviation of the model's vertical about each axis [degrees].
+    min_overlap : least share of the local model that the global map covers.
+    """
+
+    reach: float = Field(3.0, gt=0)
+    sigma_tilt_deg: float = Field(0.5, gt=0)
+    min_overlap: float = Field(0.5, gt=0, le=1)
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,16 @@ from rille.stages.terrain.merge import seen_finely
 
 
 class OcclusionBoundsParams(Params):
-    """Parameters of the stage ``occlusion_bounds``."""
+    """Parameters of the stage ``occlusion_bounds``.
 
-    sigmas: float = Field(1.25, ge=0, le=10, description="standard deviations between an elevation and the bounds")
-    max_footprint: float | None = Field(
-        None,
-        gt=0,
-        description="largest ground [m] of a pixel where a line of sight ends; not set: no limit",
-    )
+    Attributes
+    ----------
+    sigmas : standard deviations between an elevation and the bounds.
+    max_footprint : largest ground [m] of a pixel where a line of sight ends; not set: no limit.
+    """
+
+    sigmas: float = Field(1.25, ge=0, le=10)
+    max_footprint: float | None = Field(None, gt=0)
 
 
 @dataclass(frozen=True)

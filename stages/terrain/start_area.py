@@ -20,9 +20,14 @@ NO_PAIR = -1
 
 
 class StartAreaParams(Params):
-    """Parameters of the stage ``start_area``."""
+    """Parameters of the stage ``start_area``.
 
-    sigma: float = Field(0.03, gt=0, description="standard deviation [wheel diameters] of the start area's elevations")
+    Attributes
+    ----------
+    sigma : standard deviation [wheel diameters] of the start area's elevations.
+    """
+
+    sigma: float = Field(0.03, gt=0)
 
 
 def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[Lattice, np.ndarray]:

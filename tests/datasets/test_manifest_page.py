@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +19,6 @@ cameras and the rig are needed. `[cameras.left]` and `[cameras.right]` have the 
 `[cameras]`. Lengths are metres, and camera frames have x to the right, y down and z ahead, unless a key says
 otherwise. A key that is unknown is refused, and the error names the nearest one.
 """
-ENTRY = re.compile(r"^(\w+) : (.*(?:\n    .*)*)", re.M)
 
 
 def tables() -> dict[str, type[Params]]:
@@ -33,14 +30,6 @@ def tables() -> dict[str, type[Params]]:
     return found
 
 
-def meanings(model: type[Params]) -> dict[str, str]:
-    """What each key means, by the documentation of the model and of its bases, or by its own description."""
-    told = {name: field.description or "" for name, field in model.model_fields.items()}
-    for base in reversed(model.__mro__):
-        told |= {name: " ".join(words.split()) for name, words in ENTRY.findall(inspect.cleandoc(base.__doc__ or ""))}
-    return told
-
-
 def lines(name: str, model: type[Params]) -> Iterator[str]:
     """A section of the page with its table."""
     first = (model.__doc__ or "").partition("\n")[0].partition("``: ")[2]
@@ -48,9 +37,9 @@ def lines(name: str, model: type[Params]) -> Iterator[str]:
     if first:
         yield f"{first[0].upper()}{first[1:]}\n"
     yield "| key | default | meaning |\n|---|---|---|"
-    told = meanings(model)
+    told = model.meanings()
     for key, field in model.model_fields.items():
-        if model is Manifest and not told[key]:
+        if model is Manifest and key not in told:
             continue
         default = "needed" if field.is_required() else ""
         if not field.is_required() and field.default not in (None, "", (), {}):
@@ -70,10 +59,10 @@ def test_the_page_is_current() -> None:
 
 
 def test_every_key_has_a_meaning() -> None:
-    untold = [(model, key) for model in tables().values() for key, words in meanings(model).items() if not words]
+    untold = [(model, key) for model in tables().values() for key in model.model_fields if key not in model.meanings()]
     assert [key for model, key in untold if model is not Manifest] == []
     assert {key for model, key in untold} == set(tables()) - {""}
-    assert set(meanings(Cameras)) > set(meanings(PinholeLens))
+    assert set(Cameras.meanings()) > set(PinholeLens.meanings())
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from rille.datasets.text.count import count
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
@@ -29,6 +28,7 @@ from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
+from rille.stages.core.quantities import count
 
 
 def plan(

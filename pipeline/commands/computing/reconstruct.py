@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from rille.datasets.text.warning import warning
 from rille.pipeline.commands import batch
 from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.engine.plain import some, warn
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
+from rille.stages.core.errors import warning
 
 
 def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:
@@ -36,31 +36,26 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
     return code
 
 
-def _perform(seq: str, options: Options) -> tuple[int, Path]:
+def _perform(seq: str, options: Options, verb: str = "reconstruct") -> tuple[int, Path]:
     """Run a sequence, or the run of a crate again; return the exit code and the folder of the results."""
     crate = rocrate.read(Path(seq))
+    if crate is not None:
+        options = replace(
+            options,
+            config=options.config or crate.folder / "config.toml",
+            frames=options.frames or crate.options.get("--frames", (None,))[-1],
+            until=options.until or crate.options.get("--until", ()),
+            only=options.only or crate.options.get("--only", ()),
+        )
+    result = session.perform(seq if crate is None else crate.sequence, options, verb=verb)
+    result.print()
     if crate is None:
-        return _perform_sequence(seq, options, "reconstruct")
-    options = replace(
-        options,
-        config=options.config or crate.folder / "config.toml",
-        frames=options.frames or crate.options.get("--frames", (None,))[-1],
-        until=options.until or crate.options.get("--until", ()),
-        only=options.only or crate.options.get("--only", ()),
-    )
-    code, run = _perform_sequence(crate.sequence, options, "reconstruct")
-    unlike = crate.unlike(run)
+        return result.code, result.folder
+    unlike = crate.unlike(result.folder)
     print(f"{len(crate.digests) - len(unlike)} of {len(crate.digests)} results are those of {crate.folder}, to the bit")
     if unlike:
         warn(warning("RIL-041", f"other results than those of the crate: {some(unlike, 6)}"))
-    return max(code, HOLES if unlike else COMPLETE), run
-
-
-def _perform_sequence(seq: str, options: Options, verb: str) -> tuple[int, Path]:
-    """Run a sequence; return the exit code and the folder of the results."""
-    result = session.perform(seq, options, verb=verb)
-    result.print()
-    return result.code, result.folder
+    return max(result.code, HOLES if unlike else COMPLETE), result.folder
 
 
 def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -> int:
@@ -74,4 +69,4 @@ def drive(seq: str = "mockup-loop", *, options: DriveOptions = DriveOptions()) -
     seq
         A simulated sequence; mockup-loop.
     """
-    return _perform_sequence(seq, options, "drive")[0]
+    return _perform(seq, options, "drive")[0]

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.read_dem import DemFile, crs_name
@@ -20,7 +19,7 @@ from rille.pipeline.export.writers import ENGINEERING_CRS, ON_PLANE, Meaning, wr
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import FLAG, RUNS, Output, Runs, check_output, output_file
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_changes
 from rille.stages.evaluation import dem_comparison as evaluation

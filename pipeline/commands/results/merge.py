@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.datasets.text.warning import warning
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.export.read_dem import refuse_unlike_systems
@@ -20,7 +19,7 @@ from rille.pipeline.export.writers import Meaning, check_folder, write_json, wri
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Output, Run, Runs
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import ConfigError, DegenerateError, InputError
+from rille.stages.core.errors import ConfigError, DegenerateError, InputError, warning
 from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment

@@ -17,7 +17,6 @@ import numpy as np
 import tomli_w
 
 from rille.datasets.text.reading import read_toml
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store.base import Store
@@ -28,7 +27,7 @@ from rille.stages.calibration.parameter_selection import Parameter, decide
 from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
 from rille.stages.calibration.rig import RigParams
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 from rille.stages.geometry.epipolar import NAMES, corrected
 from rille.stages.geometry.geometry import Rig
 

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from rille.datasets.text.count import count
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.engine import events
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.errors import ConfigError, RilleError
+from rille.stages.core.quantities import count
 
 
 def list_runs(sequence: str = "", *, runs: Runs = RUNS) -> None:

@@ -20,12 +20,11 @@ from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import read_text
-from rille.datasets.text.warning import warning
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig, check_sides
-from rille.stages.core.errors import InputError, told
+from rille.stages.core.errors import InputError, told, warning
 from rille.stages.geometry.geometry import Sizes
 
 Image = NDArray[Any]

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.count import count
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import Output, check_new
 from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
+from rille.stages.core.quantities import count
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 

@@ -39,9 +39,13 @@ def absolute_search_paths() -> dict[str, str]:
 def leave_out() -> None:
     """Have Python processes that are started look for no module in the current folder, until :func:`take_back`.
 
-    Workers would take over an empty entry of ``sys.path``, as an interactive Python has it. Runs in one process may
-    overlap: the last that ends takes back what the first has done.
+    Workers would take over an empty entry of ``sys.path``, as an interactive Python has it, and read the file of the
+    program, which for ``python -`` is ``<stdin>``, one of the current folder. Runs in one process may overlap: the last
+    that ends takes back what the first has done.
     """
+    main = sys.modules["__main__"]
+    if not os.path.exists(getattr(main, "__file__", None) or __file__):
+        del main.__file__
     with _lock:
         os.environ["PYTHONSAFEPATH"] = "1"
         _was_on_path.append("" in sys.path)

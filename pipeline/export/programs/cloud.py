@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.datasets.georeference import Georeference
-from rille.datasets.text.count import count
 from rille.pipeline.export.colour import LUMA
 from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import frames_of, georeference_in
 from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.stages.core.quantities import count
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
 ABOUT = {

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rille.datasets.text.count import count
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
+from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.points import PairPoints, points

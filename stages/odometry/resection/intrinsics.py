@@ -1,30 +1,19 @@
-"""Errors of the calibration in the adjustment: unknowns that all segments share, each with a prior.
+"""Errors of the calibration by all segments: common to them, each with a prior; corrected where these contradict it.
 
-A wrong focal length stretches what a stereo pair sees along the optical axis, a wrong principal point shears it. A
-straight drive shows neither. Where the camera turns, it sees the same points stretched along another axis, which no
-motion explains. Each segment gives the part of its normal equations that is left for these numbers when its own
-unknowns (poses, depths, bias) are eliminated, and the change of its poses with each number. The parts of all segments
-and the priors of a usual calibration give the errors and their covariance; the trajectory adds it up like other errors
-that all segments share.
-
-The rig's yaw is an error that all disparities share: near and far landmarks ask for different motions. A straight
-drive shows that as well, so all segments count for it, each by its own common error. Where one camera stands above the
-other, pitch takes its place.
-
-A rolling shutter reads the rows one after the other: a point that wanders down the image moved for longer than one that
-does not. That looks like a wrong rig, which is then left as it is, and named. So is a rig that bends, whose yaw changes
-along the way.
+The parts of all segments (:mod:`rille.stages.odometry.resection.calibration_errors`) and the priors of a usual
+calibration give the errors and their covariance; the trajectory adds it up like other errors that all segments share.
+All segments count for the rig's yaw, each by its own common error.
 
 A number that the tracks contradict is corrected, and images, rig, segments and maps are computed anew with the
-corrected calibration. An error that does not contradict its prior is part of the covariance alone. The length of the
-baseline is held, because no image shows it.
+corrected calibration. An error that does not contradict its prior is part of the covariance alone. Rows that are read
+one after the other look like a wrong rig, which is then left as it is, and named. So is a rig that bends, whose yaw
+changes along the way.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,39 +23,18 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
-from rille.stages.geometry import epipolar, rigid
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.geometry.lens import Lens
+from rille.stages.geometry import epipolar
+from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.numeric.robust import huber_weight, mad_sigma
-from rille.stages.odometry.resection.bundle_adjustment import (
-    SegmentAdjustment,
-    SegmentNormal,
-    SegmentState,
-    SegmentTracks,
+from rille.stages.odometry.resection.calibration_errors import (
+    CORRECTED,
+    PRIORS,
+    STEP,
+    composed,
+    corrected_rig,
+    deviations,
 )
 from rille.stages.odometry.resection.landmarks import triangulated
-from rille.stages.odometry.resection.pnp import bias_information
-
-PRIORS: Mapping[str, float] = {
-    "focal length": 1.0,
-    "principal point's column": 1.0,
-    "principal point's row": 1.0,
-    "radial distortion": 1.0,
-    "pitch": 0.1,
-    "roll": 0.1,
-    "baseline across": 0.1,
-    "baseline forward": 0.1,
-}
-"""Numbers whose errors are estimated: of both cameras over the focal length, and their coefficient k1; of the rig's
-correction (:mod:`rille.stages.geometry.epipolar`), rad. With each its standard deviation over that of the focal length:
-the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
-
-CORRECTED = 3
-"""Number of these that are corrected: those of the camera without distortion."""
-
-STEP = 1e-4
-"""Change of each number by which the tracks are differentiated."""
-
 
 MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
 """Segments that turn, below which the prior of the cameras' numbers decides; and segments that have to agree on a yaw
@@ -93,166 +61,21 @@ read before the next one is: beyond an interval the tracks show something else, 
 
 
 class IntrinsicsParams(Params):
-    """Parameters of the stage ``intrinsics``."""
+    """Parameters of the stage ``intrinsics``.
 
-    prior: float = Field(
-        0.005,
-        gt=0,
-        description="standard deviation, as calibrated, of the focal length and of the principal point over the focal "
-        "length, and of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual "
-        "for a calibration with a target",
-    )
+    Attributes
+    ----------
+    prior : standard deviation, as calibrated, of the focal length and of the principal point over the focal length, and
+        of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual for a calibration
+        with a target.
+    """
+
+    prior: float = Field(0.005, gt=0)
 
     @property
     def sigma(self) -> Floats:
         """Standard deviations (k,) of :data:`PRIORS`."""
-        return self.prior * np.array(list(PRIORS.values()))
-
-
-class SegmentCameras(NamedTuple):
-    """Rig of a segment, its key's pose, and by the camera's name the lenses of images that were undistorted."""
-
-    rig: Rig
-    lenses: Mapping[str, Lens]
-    T_local_key: RigidTransform
-
-
-class IntrinsicsPart(NamedTuple):
-    """Contribution of a segment to k errors: ``information`` (k, k), ``pull`` (k,).
-
-    ``by_error`` (frame, 6, k): changes of its poses (position m, rotation vector rad of T_local_left) with each.
-    ``yaw``: information and pull of the rig's yaw, rad, by the common error of its disparities, without the prior of
-    that, which would draw it towards zero. ``read_out``: those of the time from the first to the last row, in intervals
-    between frames.
-    """
-
-    information: Floats
-    pull: Floats
-    by_error: Floats
-    yaw: tuple[float, float]
-    read_out: tuple[float, float]
-
-
-def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
-    """Camera whose focal length and principal point are changed by the first of ``errors``."""
-    larger, column, row = 1.0 + errors[0], camera.cx + errors[1] * camera.fx, camera.cy + errors[2] * camera.fy
-    return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
-
-
-def corrected_rig(
-    rig: Rig, errors: Sequence[float] | Floats, yaw: float, pitch: float = 0.0, others: Sequence[float] = (0.0,) * 3
-) -> Rig:
-    """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
-
-    Where one camera stands above the other, pitch and yaw change places.
-    """
-    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
-    turned = epipolar.corrected(rig, np.array([*first, *others]))
-    return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
-
-
-def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
-    """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
-    return corrected_rig(rig, correction, correction[-1])
-
-
-def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Floats) -> Floats:
-    """One correction in place of two that follow each other."""
-    larger = 1.0 + before[0]
-    scale = np.array([larger, larger, larger, 1.0])  # those of the cameras are over the focal length
-    return np.array(before) + scale * correction
-
-
-def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
-    """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
-    rig, T_local_key = cameras.rig, cameras.T_local_key
-    pitch, *others, yaw = errors[CORRECTED + 1 :]
-    other = corrected_rig(rig, errors, yaw, pitch, others)
-
-    def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
-        if (lens := cameras.lenses.get(side)) is not None:
-            raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
-            again = replace(lens, camera=corrected(lens.camera, errors))
-            pixels = again.undistort(raw, ideal).reshape(pixels.shape)
-        focal, centre = np.array([ideal.fx, ideal.fy]), np.array([ideal.cx, ideal.cy])
-        ray = (pixels - centre) / focal
-        return np.asarray(pixels - errors[CORRECTED] * focal * ray * (ray**2).sum(-1, keepdims=True))
-
-    key = T_local_key.inverse().apply(tracks.landmarks.position)
-    left = undistorted_anew(rig.left.project(key), "left", rig.left, other.left)
-    right = undistorted_anew(rig.right.project(rig.T_right_left.apply(key)), "right", rig.right, other.right)
-    landmarks = triangulated(left, right, other, T_local_key, tracks.landmarks.sigma)
-    pixels = undistorted_anew(tracks.pixels, "left", rig.left, other.left)
-    return replace(tracks, landmarks=landmarks, pixels=pixels, camera=other.left)
-
-
-def read_late(tracks: SegmentTracks, cameras: SegmentCameras, time: float) -> SegmentTracks:
-    """Measurements as they would be if the last row were read ``time``, in intervals between frames, later."""
-    key = cameras.rig.left.project(cameras.T_local_key.inverse().apply(tracks.landmarks.position))
-    moved = tracks.pixels - key
-    mean = moved / np.arange(1, len(moved) + 1)[:, None, None]
-    speed = np.diff(tracks.pixels, axis=0, prepend=key[None])
-    speed = np.where(np.isfinite(speed), speed, mean)  # where the frame before does not show it
-    return replace(tracks, pixels=tracks.pixels - time * moved[..., 1:] / cameras.rig.left.height * speed)
-
-
-def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
-    """Largest turn of a frame of the segment from its key, degrees."""
-    return math.degrees(rigid.angle(state.R @ T_local_key.rotation).max())
-
-
-def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: SegmentCameras) -> IntrinsicsPart:
-    """Contribution of an adjusted segment to the errors of :data:`PRIORS`, its unknowns free, by the stated errors."""
-    tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
-    *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
-    steps = [replace(problem, tracks=one) for one in (*changed, read_late(tracks, cameras, STEP))]
-    (p, n), m = normal.between.shape, len(steps)
-    by_pose, by_depth, squares, gradient = np.zeros((p, m)), np.zeros((m, n)), np.zeros((m, m)), np.zeros(m)
-    for f in range(len(state.R)):
-        errors, others = problem.errors(state, f), [one.errors(state, f) for one in steps]
-        usable = np.isfinite([one.norm for one in (errors, *others)]).all(0)
-        slope = np.stack([one.error - errors.error for one in others], axis=-1) / STEP
-        weighted = slope * np.where(usable, problem.weights(errors, f), 0.0)[:, None, None]
-        by_pose[6 * f : 6 * f + 6] = np.einsum("nai,nak->ik", errors.jacobian[..., :6], weighted, optimize=True)
-        by_depth += np.einsum("nak,na->kn", weighted, errors.jacobian[..., 6])
-        squares += np.einsum("nai,nak->ik", slope, weighted, optimize=True)
-        gradient += np.einsum("nak,na->k", weighted, errors.error)
-    # A shift of one depth and that of all depths move a pixel alike.
-    by_pose[-1] = by_depth.sum(1)
-    matrix, right = SegmentNormal(
-        np.block([[normal.poses, by_pose], [by_pose.T, squares]]),
-        np.vstack([normal.between, by_depth]),
-        normal.depths,
-        np.concatenate([normal.pose_gradient, gradient]),
-        normal.depth_gradient,
-        normal.cost,
-    ).without_depths()
-    prior = bias_information(problem.params.bias_sigma)
-    read_out = _of_read_out(matrix, right, prior, state.bias)
-    matrix, right = matrix[:-1, :-1], right[:-1]
-    inverse = np.linalg.inv(matrix[:p, :p])
-    step = -inverse @ matrix[:p, p:]
-    # Of C = -R^T t and of R^T, by the left perturbation of T_cam_local.
-    by_error = np.swapaxes(state.R, 1, 2)[:, None] @ -step[:-1].reshape(-1, 2, 3, k)
-    information = matrix[p:, p:] + matrix[p:, :p] @ step
-    moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
-    along = (moved * ray).sum(1) / (ray**2).sum(1)
-    px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
-    yaw = max(of_bias - prior, 0.0) * px_per_rad**2, of_bias * state.bias * px_per_rad
-    return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw, read_out)
-
-
-def _of_read_out(matrix: Floats, right: Floats, prior: float, bias: float) -> tuple[float, float]:
-    """Information and pull of the last unknown, the time between the rows: poses and the bias before the errors of
-    :data:`PRIORS` are free, the bias without the ``prior`` of its own, for it is the yaw."""
-    k = len(PRIORS) + 1
-    # The errors are those of a usual calibration, the bias one of 10 px.
-    hold = np.zeros(len(right))
-    hold[-k - 1 : -1] = [0.01 - prior, *IntrinsicsParams().sigma ** -2.0]
-    free, pull = matrix + np.diag(hold), right.copy()
-    pull[-k - 1] += prior * bias
-    answer = np.linalg.solve(free[:-1, :-1], free[:-1, -1])
-    return float(free[-1, -1] - answer @ free[:-1, -1]), float(pull[-1] - answer @ pull[:-1])
+        return deviations(self.prior)
 
 
 class CommonErrors(NamedTuple):
@@ -363,10 +186,7 @@ def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
 
 
 def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> str:
-    """One line on a yaw (``name``) that was changed by an angle, rad, or would be, were it not ``fixed``; empty if it
-    is 0."""
-    if not angle:
-        return ""
+    """One line on a yaw (``name``) that was changed by an angle, rad, or would be, were it not ``fixed``."""
     outcome = "kept because rig.mode = fixed: depths and lengths are off by that" if fixed else "corrected"
     return (
         "the tracks contradict the rig: near and far landmarks ask for different motions, unless the right camera is "
@@ -376,9 +196,7 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
 
 
 def read_out_contradiction(time: float, sigma: float) -> str:
-    """One line on a time from the first to the last row, in intervals between frames; empty if it is 0."""
-    if not time:
-        return ""
+    """One line on a time from the first to the last row, in intervals between frames."""
     return (
         "rows of an image are not of one time (rolling shutter), or lights move along with the cameras: the tracks ask "
         f"for {time:+.2f} +- {sigma:.2f} intervals between frames from the first row to the last; path and elevations "
@@ -387,9 +205,7 @@ def read_out_contradiction(time: float, sigma: float) -> str:
 
 
 def bend_contradiction(angle: float, sigma: float, name: str) -> str:
-    """One line on the change of the rig's yaw (``name``), rad, from the first segment to the last; empty if it is 0."""
-    if not angle:
-        return ""
+    """One line on the change of the rig's yaw (``name``), rad, from the first segment to the last."""
     return (
         "the rig bends along the way: near and far landmarks ask for a right camera that turns by "
         f"{math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees ({name}) from the first segment to the last; "
@@ -442,11 +258,9 @@ def intrinsics_stage(
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
     late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
-    if not fixed:
-        turn = turn or hidden_yaw(segments, given)
     sigma = np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
-    if turn and not fixed:
+    if not fixed and (turn := turn or hidden_yaw(segments, given)):
         correction = np.array([*np.zeros(CORRECTED), turn])
     facts: IntrinsicsFacts = {
         "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
@@ -463,9 +277,9 @@ def intrinsics_stage(
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
     name = epipolar.angle_along(given)
-    angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed)
-    bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name)
-    rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0]))
+    angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed) if off else ""
+    bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name) if bent else ""
+    rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0])) if late else ""
     if doubt := "; ".join(filter(None, [rows, bends, cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Params, stage
@@ -23,9 +22,14 @@ from rille.stages.odometry.resection.landmarks import triangulated
 
 
 class MovingParams(Params):
-    """Parameters of the stage ``moving``."""
+    """Parameters of the stage ``moving``.
 
-    enabled: bool = Field(True, description="leave what moves by itself out of the world's terrain")
+    Attributes
+    ----------
+    enabled : leave what moves by itself out of the world's terrain.
+    """
+
+    enabled: bool = True
 
 
 def departures(

@@ -30,7 +30,7 @@ from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.pose_arrays import BY_INTRINSICS, COVARIANCE, POSES, SHARED
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.odometry.resection.bundle_adjustment import PosedTracks, SegmentAdjustment, adjust, pose_errors
-from rille.stages.odometry.resection.intrinsics import PRIORS, SegmentCameras, contribution, turn_deg
+from rille.stages.odometry.resection.calibration_errors import PRIORS, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,

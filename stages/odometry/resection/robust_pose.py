@@ -60,33 +60,27 @@ THRESHOLD_SHARES = (0.25, 0.5, 1.0)
 
 
 class ResectParams(Params):
-    """Parameters of the stage ``resect``."""
+    """Parameters of the stage ``resect``.
 
-    pixel_sigma: float = Field(0.2, gt=0, description="standard deviation [pixels] of a tracked position")
-    disparity_sigma: float = Field(
-        0.2,
-        ge=0,
-        description="standard deviation [pixels] of the disparity under a landmark; moves the landmark along its ray",
-    )
-    bias_sigma: float = Field(
-        0.1,
-        ge=0,
-        description="prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig); 0: "
-        "no such error",
-    )
-    threshold: float = Field(
-        1.0,
-        gt=0,
-        description="largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all "
-        "are below; 1.0: 5 pixel_sigma",
-    )
-    joint: bool = Field(True, description="then adjust all poses and landmark depths of a segment jointly")
-    max_position_ratio: float = Field(
-        0.02,
-        gt=0,
-        description="largest standard deviation of the camera position over the landmarks' median distance; beyond, "
-        "the pose counts as degenerate",
-    )
+    Attributes
+    ----------
+    pixel_sigma : standard deviation [pixels] of a tracked position.
+    disparity_sigma : standard deviation [pixels] of the disparity under a landmark; moves the landmark along its ray.
+    bias_sigma : prior standard deviation [pixels] of an error common to all disparities (toe-in of the rig); 0: no such
+        error.
+    threshold : largest back-projection error [pixels] of an inlier; the worst landmarks are removed until all are
+        below; 1.0: 5 pixel_sigma.
+    joint : then adjust all poses and landmark depths of a segment jointly.
+    max_position_ratio : largest standard deviation of the camera position over the landmarks' median distance; beyond,
+        the pose counts as degenerate.
+    """
+
+    pixel_sigma: float = Field(0.2, gt=0)
+    disparity_sigma: float = Field(0.2, ge=0)
+    bias_sigma: float = Field(0.1, ge=0)
+    threshold: float = Field(1.0, gt=0)
+    joint: bool = True
+    max_position_ratio: float = Field(0.02, gt=0)
 
 
 @dataclass(frozen=True)

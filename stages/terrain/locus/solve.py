@@ -21,36 +21,32 @@ MAX_JUMP_PX = 3.0  # range of the four disparities around a cell that are one su
 
 
 class LocusParams(Params):
-    """Parameters of the stage ``locus``."""
+    """Parameters of the stage ``locus``.
 
-    cell_size: float | None = Field(None, gt=0, description="side of a cell [m]; not set: it follows from the rig")
-    extent: tuple[float, float, float, float] | None = Field(
-        None, description="x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well"
-    )
-    max_range_cells: float = Field(
-        6.0, gt=0, description="number of cells that a pixel may cover along the range within the automatic extent"
-    )
-    max_sigma: float | None = Field(
-        None,
-        gt=0,
-        description="largest standard deviation [m], by sigma_disparity; not set: one cell size, and above a plane "
-        "that is no ground ten times that of the median match",
-    )
-    max_std: float | None = Field(
-        None, gt=0, description="largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma"
-    )
-    sigma_disparity: float = Field(0.2, gt=0, description="standard deviation of a typical disparity [pixels]")
-    max_residual: float = Field(0.5, gt=0, description="largest residual |p_l + d - p_r| of a solution [pixels]")
-    refine_steps: int = Field(
-        3,
-        ge=0,
-        le=20,
-        description="number of Gauss-Newton steps that refine the elevations by both images; 6 for matches of preset "
-        "fast, 3 for others; 0: none",
-    )
-    both: bool = Field(
-        False, description="also match from right to left and use both elevations; doubles the time of matching"
-    )
+    Attributes
+    ----------
+    cell_size : side of a cell [m]; not set: it follows from the rig.
+    extent : x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well.
+    max_range_cells : number of cells that a pixel may cover along the range within the automatic extent.
+    max_sigma : largest standard deviation [m], by sigma_disparity; not set: one cell size, and above a plane that is no
+        ground ten times that of the median match.
+    max_std : largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma.
+    sigma_disparity : standard deviation of a typical disparity [pixels].
+    max_residual : largest residual |p_l + d - p_r| of a solution [pixels].
+    refine_steps : number of Gauss-Newton steps that refine the elevations by both images; 6 for matches of preset fast,
+        3 for others; 0: none.
+    both : also match from right to left and use both elevations; doubles the time of matching.
+    """
+
+    cell_size: float | None = Field(None, gt=0)
+    extent: tuple[float, float, float, float] | None = None
+    max_range_cells: float = Field(6.0, gt=0)
+    max_sigma: float | None = Field(None, gt=0)
+    max_std: float | None = Field(None, gt=0)
+    sigma_disparity: float = Field(0.2, gt=0)
+    max_residual: float = Field(0.5, gt=0)
+    refine_steps: int = Field(3, ge=0, le=20)
+    both: bool = False
 
 
 def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) -> Observed:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -134,6 +135,15 @@ def test_the_last_of_two_runs_in_one_interactive_python_takes_the_path_back(monk
     take_back()
     assert sys.path[0] == ""
     assert "PYTHONSAFEPATH" not in os.environ
+
+
+def test_a_program_from_standard_input_has_no_file_that_workers_would_read(monkeypatch):
+    program = ModuleType("__main__")
+    program.__file__ = "<stdin>"
+    monkeypatch.setitem(sys.modules, "__main__", program)
+    leave_out()
+    take_back()
+    assert not hasattr(program, "__file__")
 
 
 def test_workers_and_their_tracker_leave_it_out_of_the_path_of_an_interactive_python(folder, tmp_path):

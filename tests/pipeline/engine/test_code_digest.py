@@ -217,3 +217,8 @@ def test_a_damaged_memory_of_sources_is_none(package, memory, tmp_path):
         assert package() == first
     file.write_bytes(whole)
     assert memory().known
+
+
+def test_poses_of_a_segment_do_not_depend_on_what_judges_all_segments():
+    room = "rille.stages.odometry.resection"
+    assert f"{room}.intrinsics" not in code_digest.module_digests(f"{room}.resect")

@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-import types
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -221,16 +220,6 @@ def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_p
     with raises("RIL-972", f"line 9 of {program}"):
         runpy.run_path(str(program), run_name=name)
     exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": workers.check})  # no worker imports it
-
-
-def test_a_program_from_standard_input_has_no_file_that_workers_would_read(monkeypatch):
-    program = types.ModuleType("__main__")
-    program.__file__ = "<stdin>"
-    monkeypatch.setitem(sys.modules, "__main__", program)
-    workers.check("inline")
-    assert program.__file__ == "<stdin>"
-    workers.check("dask")
-    assert not hasattr(program, "__file__")
 
 
 def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):

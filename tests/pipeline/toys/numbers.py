@@ -7,10 +7,10 @@ from rille.stages.core.declare import Array, Bundle, Params, Stage
 
 
 class NumbersParams(Params):
-    """Parameters of the source."""
+    """Parameters of the source: ``seed`` of the generator, and ``size``, the edge, pixels."""
 
-    seed: int = Field(0, ge=0, description="of the generator")
-    size: int = Field(40, ge=1, description="edge, pixels")
+    seed: int = Field(0, ge=0)
+    size: int = Field(40, ge=1)
 
 
 def _run(params, args, inputs):

@@ -1,14 +1,12 @@
 """One in, one out, with a helper in another file."""
 
-from pydantic import Field
-
 from rille.stages.core.declare import Array, Bundle, Params, Stage
 
 
 class ScaleParams(Params):
-    """Parameters."""
+    """Parameters: ``offset``, m."""
 
-    offset: float = Field(0.0, description="m")
+    offset: float = 0.0
 
 
 def _run(params, args, inputs):

@@ -9,7 +9,8 @@ from matching_scenes import Texture
 
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.core.validity import Validity, has, matched
-from rille.stages.hfvm.given import better_reading, check, hfvm_given_stage
+from rille.stages.hfvm.given import check, hfvm_given_stage
+from rille.stages.hfvm.map_reading import better_reading
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import PyramidParams, pyramid_stage

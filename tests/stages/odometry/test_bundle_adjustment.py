@@ -17,7 +17,7 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     adjust,
     pose_errors,
 )
-from rille.stages.odometry.resection.intrinsics import SegmentCameras
+from rille.stages.odometry.resection.calibration_errors import SegmentCameras
 from rille.stages.odometry.resection.landmarks import Landmarks, SegmentPoints
 from rille.stages.odometry.resection.pnp import pose_covariance
 from rille.stages.odometry.resection.resect import SegmentPoses, adjust_segment

@@ -17,19 +17,17 @@ from rille.stages.odometry.resection.bundle_adjustment import (
     adjust,
     pose_errors,
 )
-from rille.stages.odometry.resection.intrinsics import (
+from rille.stages.odometry.resection.calibration_errors import (
     CORRECTED,
     PRIORS,
-    IntrinsicsParams,
     SegmentCameras,
     calibrated_anew,
-    common_errors,
     composed,
     contribution,
     corrected,
-    intrinsics_stage,
     with_errors,
 )
+from rille.stages.odometry.resection.intrinsics import IntrinsicsParams, common_errors, intrinsics_stage
 from rille.stages.odometry.resection.landmarks import SegmentPoints, triangulated
 from rille.stages.odometry.resection.resect import resect_segment
 from rille.stages.odometry.resection.robust_pose import ResectParams

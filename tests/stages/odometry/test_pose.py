@@ -6,7 +6,7 @@ import pytest
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lattice import Lattice
-from rille.stages.odometry.resection import pose
+from rille.stages.odometry import pose
 from rille.stages.terrain import merge
 
 
