@@ -30,9 +30,9 @@ SIMULATED = {
 REAL = {
     "kitti06_51": {
         "frames_posed": 6,
-        "trajectory_drift": 1.10,  # per cent of 6 m
-        "trajectory_ate_rmse": 0.00695,  # metres
-        "trajectory_rpe_translation_rmse": 0.0105,  # metres
+        "trajectory_drift": 1.08,  # per cent of 6 m
+        "trajectory_ate_rmse": 0.0049,  # metres
+        "trajectory_rpe_translation_rmse": 0.0112,  # metres
         "matched": 0.787,
         "mapped_area": 317,  # square metres
         "elevation_sigma": 0.0191,  # metres

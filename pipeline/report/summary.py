@@ -23,9 +23,11 @@ from rille.stages.core.quantities import count, metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry import rigid
+from rille.stages.geometry.epipolar import standing
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.hfvm.coarse import ImageDifference
 from rille.stages.odometry.resection.calibration_errors import CORRECTED
+from rille.stages.odometry.resection.intrinsics import MIN_YAW_PX
 from rille.stages.odometry.resection.trajectory import world_poses
 from rille.stages.terrain.reference import camera_height, seen_up
 
@@ -272,7 +274,23 @@ def resting(view: RunView) -> list[str]:
     numbers = list(facts.get("errors", {}).items())[:CORRECTED]
     held = [f"{name} +- {100.0 * sigma:.2g} %" for name, (_, sigma) in numbers if name in facts["held"]]
     text = "These numbers of the cameras rest on the calibration as given, for the tracks show little of them"
-    return [f"{text}: {', '.join(held)} of the focal length; the covariances of poses hold that."] if held else []
+    lines = [f"{text}: {', '.join(held)} of the focal length; the covariances of poses hold that."] if held else []
+    return lines + toed_in(view)
+
+
+def toed_in(view: RunView) -> list[str]:
+    """A line on a toe-in that poses are corrected for and elevations are not, if it is known and more than little."""
+    facts, rig = facts_of(view, view.products.intrinsics), view.sequence.rig
+    angle, sigma = facts.get("errors", {}).get("toe-in", (0.0, 1.0))
+    span, focal = (rig.left.height, rig.left.fy) if standing(rig) else (rig.left.width, rig.left.fx)
+    off = abs(angle) * focal * (0.5 * span / focal) ** 2
+    if abs(angle) < 5.0 * sigma or off < MIN_YAW_PX:
+        return []
+    return [
+        f"By the tracks, disparities at the sides of the image are off by {off:.1f} px against its middle, as if the "
+        f"right camera were turned by {math.degrees(angle):+.3f} +- {math.degrees(sigma):.3f} degrees and its "
+        "principal point took that back (toe-in). Poses are corrected for it, elevations are not: calibrate anew."
+    ]
 
 
 AGAINST_TRUTH = {

@@ -81,10 +81,10 @@ class ResectFacts(Facts):
 
 
 class IntrinsicsFacts(Facts):
-    """``errors`` of the calibration, each with its sigma, and their ``covariance``; those that are ``held`` by the
-    calibration as given, since the sequence shows them little; the rig's ``yaw`` and its sigma, rad; the ``correction``
-    that the tracks ask for (else 0) of focal length and principal point, over the focal length, and of the yaw; and how
-    the calibration that was given is ``corrected`` with that and those before."""
+    """``errors`` of the calibration, each with its sigma, and the ``covariance`` of those that poses keep; those that
+    are ``held`` by the calibration as given, since the sequence shows them little; the rig's ``yaw`` and its sigma,
+    rad; the ``correction`` that the tracks ask for (else 0) of focal length and principal point, over the focal length,
+    and of the yaw; and how the calibration that was given is ``corrected`` with that and those before."""
 
     errors: dict[str, list[float]]
     covariance: list[list[float]]

@@ -6,9 +6,11 @@ motion explains. Each segment gives the part of its normal equations that is lef
 unknowns (poses, depths, bias) are eliminated, and the change of its poses with each number.
 
 The rig's yaw is an error that all disparities share: near and far landmarks ask for different motions. A straight
-drive shows that as well, by the common error of its disparities. Where one camera stands above the other, pitch takes
-its place. A rolling shutter reads the rows one after the other: a point that wanders down the image moved for longer
-than one that does not. The length of the baseline is held, because no image shows it.
+drive shows that as well, by the common error of its disparities. Toe-in is a yaw whose shift in the middle of the image
+a wrong principal point takes back: disparities at the sides are off, which a straight drive shows, too. Where one
+camera stands above the other, pitch takes the place of yaw. A rolling shutter reads the rows one after the other: a
+point that wanders down the image moved for longer than one that does not. The length of the baseline is held, because
+no image shows it.
 """
 
 from __future__ import annotations
@@ -42,10 +44,11 @@ PRIORS: Mapping[str, float] = {
     "roll": 0.1,
     "baseline across": 0.1,
     "baseline forward": 0.1,
+    "toe-in": 1.0,
 }
 """Numbers whose errors are estimated: of both cameras over the focal length, and their coefficient k1; of the rig's
-correction (:mod:`rille.stages.geometry.epipolar`), rad. With each its standard deviation over that of the focal length:
-the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
+correction (:mod:`rille.stages.geometry.epipolar`), rad; and its toe-in, rad. With each its standard deviation over that
+of the focal length: the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
 
 CORRECTED = 3
 """Number of these that are corrected: those of the camera without distortion."""
@@ -101,6 +104,14 @@ def corrected_rig(
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 
 
+def toed_in(rig: Rig, angle: float) -> Rig:
+    """Rig whose right camera has a yaw, rad, that its principal point takes back for what is far ahead."""
+    turned, far = corrected_rig(rig, np.zeros(CORRECTED), angle), np.array([0.0, 0.0, 100.0 * rig.baseline])
+    before, after = (one.right.project(one.T_right_left.apply(far)) for one in (rig, turned))
+    cx, cy = np.array([rig.right.cx, rig.right.cy]) - (after - before)
+    return replace(turned, right=replace(turned.right, cx=cx, cy=cy))
+
+
 def calibrated_anew(rig: Rig, correction: Sequence[float]) -> Rig:
     """Rig whose cameras are changed by the first :data:`CORRECTED` of a correction, and whose yaw by the last, rad."""
     return corrected_rig(rig, correction, correction[-1])
@@ -116,8 +127,8 @@ def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Flo
 def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
     """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
-    pitch, *others, yaw = errors[CORRECTED + 1 :]
-    other = corrected_rig(rig, errors, yaw, pitch, others)
+    pitch, *others, toe_in, yaw = errors[CORRECTED + 1 :]
+    other = toed_in(corrected_rig(rig, errors, yaw, pitch, others), toe_in)
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:

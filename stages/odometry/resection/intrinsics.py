@@ -2,7 +2,9 @@
 
 The parts of all segments (:mod:`rille.stages.odometry.resection.calibration_errors`) and the priors of a usual
 calibration give the errors and their covariance; the trajectory adds it up like other errors that all segments share.
-All segments count for the rig's yaw, each by its own common error.
+All segments count for the rig's yaw, each by its own common error, and for its toe-in, for which the trajectory's poses
+are corrected to first order: a rig of the usual calibration may have one of several pixels at the sides of the images,
+and a drive over near ground sees another length of its way than one without.
 
 A number that the tracks contradict is corrected, and images, rig, segments and maps are computed anew with the
 corrected calibration. An error that does not contradict its prior is part of the covariance alone. Rows that are read
@@ -100,6 +102,7 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
     least : error up to which a prior is believed.
     """
     held, wrong = np.diag(sigma**-2.0), np.zeros(len(sigma), bool)
+    shown = (np.diagonal(information, axis1=1, axis2=2) > 0).sum(1).clip(1)
     while True:
         prior, weight, spread = held * ~wrong, np.ones(len(pull)), 1.0
         for _ in range(5):  # of a segment that is far off, no more than of one at two deviations
@@ -108,7 +111,7 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
             errors = np.linalg.solve(matrix + prior, right)
             rest = pull - information @ errors
             square = np.einsum("si,si->s", rest, np.linalg.solve(information + held, rest[..., None])[..., 0])
-            off = np.sqrt(square / len(sigma))
+            off = np.sqrt(square / shown)
             # At least what the segments claim: few of them may agree by chance.
             spread = max(1.0, float(np.median(off))) if len(off) else 1.0
             weight = huber_weight(off, 2.0 * spread)
@@ -122,6 +125,16 @@ def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float
         if departure.max() <= 5.0:
             return CommonErrors(errors, np.linalg.inv(matrix + prior), wrong)
         wrong[departure.argmax()] = True
+
+
+def of_toe_in(information: Floats, pull: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """What segments (s, k, k), (s, k) show of the toe-in, the last number, while their priors hold the others."""
+    free = information[:, :-1, :-1] + np.diag(sigma[:-1] ** -2.0)
+    answer = np.linalg.solve(free, information[:, :-1, -1:])[..., 0]
+    alone, its_pull = np.zeros_like(information), np.zeros_like(pull)
+    alone[:, -1, -1] = information[:, -1, -1] - (answer * information[:, :-1, -1]).sum(1)
+    its_pull[:, -1] = pull[:, -1] - (answer * pull[:, :-1]).sum(1)
+    return alone, its_pull
 
 
 def alone(shown: Floats, least: float, *, change: bool = False) -> tuple[CommonErrors, float]:
@@ -221,7 +234,7 @@ def inverse_depth_std(yaw: Sequence[float], baseline: float) -> float:
     return float(2.0 ** (round(2.0 * math.log2(math.hypot(*yaw) / baseline)) / 2.0))
 
 
-@stage("intrinsics", version=5)
+@stage("intrinsics", version=6)
 def intrinsics_stage(
     params: IntrinsicsParams,
     segments: Sequence[Bundle[ResectFacts]],
@@ -236,20 +249,19 @@ def intrinsics_stage(
     wrong, the tracks mislead about the cameras.
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
+    information = np.array([part["information"] for part in parts]).reshape(-1, k, k)
+    pull = np.array([part["pull"] for part in parts]).reshape(-1, k)
     # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
-    turning = [part for part in parts if part["turn_deg"] >= 4.0]
+    turning = np.array([part["turn_deg"] >= 4.0 for part in parts], bool)
+    straight = ~turning | (turning.sum() < MIN_SEGMENTS)
+    information[straight], pull[straight] = of_toe_in(information[straight], pull[straight], params.sigma)
     given = Rig.from_dict(rig.meta["rig"])
     focal, upright = given.left.fx, epipolar.standing(given)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
-    enough = [part for part in turning if len(turning) >= MIN_SEGMENTS]
-    common = common_errors(
-        np.array([part["information"] for part in enough]).reshape(-1, k, k),
-        np.array([part["pull"] for part in enough]).reshape(-1, k),
-        params.sigma,
-        MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR,
-    )
-
+    least = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
+    common = common_errors(information, pull, params.sigma, least)
+    left = np.append(common.errors[:-1], 0.0)  # poses are corrected for the toe-in
     shown = {name: np.array([part[name] for part in parts]).reshape(-1, 2) for name in ("yaw", "read_out")}
     least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
     yaw, turn = alone(shown["yaw"], least / focal)
@@ -265,7 +277,7 @@ def intrinsics_stage(
     facts: IntrinsicsFacts = {
         "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
-        "covariance": (common.covariance + np.outer(common.errors, common.errors)).tolist(),
+        "covariance": (common.covariance + np.outer(left, left)).tolist(),
         # These rest on the calibration as given.
         "held": [name for name, share in zip(names, sigma / params.sigma, strict=True) if share > 0.7],
         "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],

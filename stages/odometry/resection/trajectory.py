@@ -35,7 +35,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
-from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal, rotation_exp
 from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, NO_VERTICAL, OWN_COVARIANCE, POSES
 
 MAX_TILT_DEG = 5.0
@@ -61,8 +61,11 @@ class ChainLink(NamedTuple):
         poses, covariance, shared = (np.asarray(segment[name]) for name in ("poses", "covariance", "shared"))
         if intrinsics is None:
             return ChainLink(poses, covariance, shared, np.zeros((len(poses), 6, 0)))
-        root = np.linalg.cholesky(np.array(intrinsics.meta["covariance"]))
-        return ChainLink(poses, covariance, shared, np.asarray(segment["by_intrinsics"]) @ root)
+        by_error, meta = np.asarray(segment["by_intrinsics"]), intrinsics.meta
+        moved = by_error[..., -1] * meta["errors"]["toe-in"][0]
+        turns = np.array([rotation_exp(turn) for turn in moved[:, 3:]])
+        poses = np.concatenate([turns @ poses[:, :, :3], poses[:, :, 3:] + moved[:, :3, None]], axis=2)
+        return ChainLink(poses, covariance, shared, by_error @ np.linalg.cholesky(np.array(meta["covariance"])))
 
 
 @dataclass(frozen=True)
@@ -282,7 +285,7 @@ class TrajectoryInputs(NamedTuple):
 
 @stage(
     "trajectory",
-    version=4,
+    version=5,
     outputs=[
         replace(POSES, frame="world"),
         replace(COVARIANCE, frame="world"),

@@ -25,7 +25,7 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, summary
 from rille.stages.core.declare import Bundle
-from rille.stages.geometry.geometry import rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import PathParams
@@ -79,6 +79,17 @@ def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(s
     assert len(lines) == told
     assert all("stands still" in line and "5 frames" in line for line in lines)
     assert summary._resting(None) == []
+
+
+@pytest.mark.parametrize(("angle", "told"), [(0.0025, True), (0.0005, False), (0.0, False)])
+def test_a_toe_in_is_told_where_it_moves_disparities_at_the_sides(angle, told, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(707.0, 707.0, 612.5, 184.5, 1226, 370)
+    rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
+    monkeypatch.setattr(summary, "facts_of", lambda *_: {"errors": {"toe-in": [angle, 0.0001]}})
+    products = SimpleNamespace(intrinsics=None)
+    lines = summary.toed_in(SimpleNamespace(products=products, sequence=SimpleNamespace(rig=rig)))
+    assert bool(lines) == told
+    assert all("by 1.3 px" in line and "+0.143 +- 0.006 degrees" in line for line in lines)
 
 
 def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> None:

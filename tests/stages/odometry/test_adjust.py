@@ -250,7 +250,7 @@ def test_an_error_of_the_calibration_stays_in_the_covariance_however_many_frames
         way = one["poses"][:, :, 3] - one["poses"][0, :, 3]
         by = np.concatenate([way, np.zeros_like(way)], axis=1)[:, :, None]
         scaled.append(Bundle(dict(one.arrays) | {"by_intrinsics": by}, one.meta))
-    scale = {"intrinsics": Bundle({}, {"covariance": [[1e-4]]})}
+    scale = {"intrinsics": Bundle({}, {"covariance": [[1e-4]], "errors": {"toe-in": [0.0, 0.01]}})}
     levels = [Bundle({}, {"T_local_left": one["poses"][0].ravel().tolist(), "source": "attitude"}) for one in scaled]
     inputs = {"segments": scaled, "levels": levels, **scale}
     before = trajectory_stage.run(NoParams(), {"frames": list(range(frames))}, inputs)

@@ -25,6 +25,7 @@ from rille.stages.odometry.resection.calibration_errors import (
     composed,
     contribution,
     corrected,
+    toed_in,
     with_errors,
 )
 from rille.stages.odometry.resection.intrinsics import IntrinsicsParams, common_errors, intrinsics_stage
@@ -164,8 +165,33 @@ def test_right_numbers_are_believed(lens):
 def test_a_straight_drive_rests_on_the_given_numbers_and_their_prior():
     facts = facts_of(corrected(CAMERA, [0.1, 0.0, 0.0]), Lens(CAMERA), turn=0.0)
     assert "contradiction" not in facts
-    assert facts["held"] == list(NAMES)
-    assert np.array(facts["covariance"]) == pytest.approx(np.diag(SIGMA**2))
+    assert facts["held"] == list(NAMES[:-1])
+    assert np.array(facts["covariance"])[:-1, :-1] == pytest.approx(np.diag(SIGMA[:-1] ** 2))
+
+
+@pytest.mark.parametrize("centre", [(-0.12, 0.0, 0.0), (0.01, -0.12, 0.0)], ids=["side by side", "one above the other"])
+@pytest.mark.parametrize("angle", [0.004, -0.003])
+def test_poses_are_corrected_for_a_toe_in_that_a_straight_drive_shows(angle, centre):
+    segments, poses, true = [], [], []
+    for seed in range(6):
+        tracks, state, cameras = segment(seed, CAMERA, Lens(CAMERA), 0.0, 0.0, RigidTransform(np.eye(3), centre), 0.5)
+        rig, key = cameras.rig, LEVEL.inverse().apply(tracks.landmarks.position)
+        left, right = rig.left.project(key), rig.right.project(rig.T_right_left.apply(key))
+        off = toed_in(rig, angle)
+        landmarks = triangulated(left, right, off, LEVEL, tracks.landmarks.sigma)
+        segments.append((replace(tracks, landmarks=landmarks), state, cameras._replace(rig=off)))
+        end = adjust(segments[-1][0], state, PARAMS).state
+        poses.append(-np.einsum("fji,fj->fi", end.R, end.t))
+        true.append(-np.einsum("fji,fj->fi", state.R, state.t))
+    facts = facts_from(segments)
+    found, sigma = facts["errors"]["toe-in"]
+    assert found == pytest.approx(-angle, abs=4.0 * sigma)
+    assert abs(angle) > 8.0 * sigma
+    assert not any(facts["correction"])
+    parts = [contribution(SegmentAdjustment(tracks, PARAMS), state, cameras) for tracks, state, cameras in segments]
+    by = found * np.array([part.by_error[:, :3, -1] for part in parts])
+    before, after = (np.linalg.norm((np.array(poses) + part - true).mean((0, 1))) for part in (0.0, by))
+    assert after < 0.3 * before
 
 
 @pytest.mark.parametrize("yaw", [0.003, -0.006])
