@@ -22,7 +22,7 @@ from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
-from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
+from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
 from rille.datasets.text.count import count
@@ -59,7 +59,7 @@ class FoundImages:
     sizes : of the left and of the right images, if all of a side have the same.
     why : how left and right were recognised.
     trouble : why the images cannot be paired; empty: they can.
-    stamped : whether the file names are times since an epoch.
+    stamped : whether the left images' names are times, since 1970 or as date and time of day.
     sides : the words or letters in the names that mark left and right.
     absent : missing files of pairs, which are counted in ``pairs``.
     lines : on the pairing by time stamps in the names, if these differ.
@@ -265,7 +265,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {sides[0]!r} and {sides[1]!r}",
         trouble,
-        all(stamp_of(path.stem) for path in left),
+        bool(pairing.times_in_names([pair.left for pair in matched])),
         sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
@@ -285,7 +285,7 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             header = common_header(images[:1]).header
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
-    return InputError("RIL-194", text, remedy=remedy)
+    return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 
 def _place(path: Path, without: str) -> str:
