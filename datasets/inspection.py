@@ -24,7 +24,16 @@ from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
+from rille.datasets.poses import (
+    QUATERNION,
+    matrix_at,
+    meanings,
+    names_positions,
+    of_images,
+    positions_of,
+    projected,
+    untimed,
+)
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
@@ -396,7 +405,7 @@ def table_kind(path: Path, pairs: int) -> str:
         )
     named = "times" if "time" in path.stem.lower() else ""
     try:
-        table = read_table(path, "table")
+        table = projected(read_table(path, "table"))
     except InputError:
         return named
     row = table.values(range(table.columns))[0]
@@ -411,8 +420,8 @@ def table_kind(path: Path, pairs: int) -> str:
     if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
     positions = positions_of(table, "csv", {}) if names_positions(table) else None
-    # Without times there must be one for each pair.
-    if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
+    # Without times or names of images there must be one for each pair.
+    if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
     # Names of images, dates and the like are no numbers.
     return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")

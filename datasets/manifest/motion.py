@@ -7,7 +7,7 @@ import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -247,11 +247,8 @@ class MotionReader:
         InputError
             The file names none of them, or one twice.
         """
-        known = {PurePosixPath(image).parts: pose for image, pose in zip(timed.images, timed.poses, strict=True)}
-        # By the last parts of the path, as many as in the file: COLMAP's names begin at its folder of images.
-        paths = [pair.left.parts for pair in self.pairs]
-        stated = ([path[k:] for k in range(len(path)) if path[k:] in known] for path in paths)
-        poses = tuple(known[parts[0]] if parts else None for parts in stated)
+        rows = _rows_of_images(timed.images, self.pairs)
+        poses = tuple(None if row is None else timed.poses[row] for row in rows)
         if not any(poses):
             text = f"{timed.name} has poses of {ends([Path(image) for image in timed.images])}, none of a left image"
             left = ends([pair.left for pair in self.pairs])
@@ -307,6 +304,8 @@ class MotionReader:
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
         """Positions in metres, and their times (s) by the images' clock; None: one for each pair.
 
+        Rows that begin with names of images are those of the left images of these names.
+
         Raises
         ------
         InputError
@@ -318,9 +317,17 @@ class MotionReader:
             refuse_apart(times, self.sequence.times, found.name)
             return found.positions, times
         rows = found.positions[: len(self.pairs)] if self.growing else found.positions
-        if len(rows) != len(self.pairs):
-            text = f"{table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
-            remedy = "give one a pair, or times of both ([times] of the pairs)"
+        at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
+        clock = None if len(at) == len(self.pairs) else self.sequence.times
+        if at and (clock or len(at) == len(self.pairs)):
+            return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
+        of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
+        if of_images or len(rows) != len(self.pairs):
+            there = f"{len(at)} positions by names of left images" if of_images else f"{len(rows)} positions"
+            text = f"{table}.file: {section.file} has {there} for {len(self.pairs)} pairs"
+            remedy = (
+                "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
+            )
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
 
@@ -370,6 +377,20 @@ class MotionReader:
             notes=(*sequence.notes, *inertial.notes),
             warnings=(*sequence.warnings, *inertial.warnings),
         )
+
+
+def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[int | None]:
+    """The row of each pair's left image by its name in a file, with or without folders and ending; None: there is none.
+
+    By the last parts of the path, as many as in the file: COLMAP's names begin at its folder of images.
+    """
+
+    def parts(name: str) -> tuple[str, ...]:
+        return tuple(re.split(r"[/\\]", name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name))
+
+    known = {parts(name): row for row, name in enumerate(names)}
+    paths = [parts(str(pair.left)) for pair in pairs]
+    return [next((known[path[k:]] for k in range(len(path)) if path[k:] in known), None) for path in paths]
 
 
 def _counts(rows: Sequence[Sequence[str]]) -> bool:
