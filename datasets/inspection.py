@@ -28,15 +28,13 @@ from rille.datasets.poses import (
     QUATERNION,
     matrix_at,
     meanings,
-    names_positions,
     of_images,
     positions_of,
-    projected,
+    table_of_motion,
     untimed,
 )
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
-from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
@@ -394,7 +392,8 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It is no text, has decimal commas, or is one of true positions by its columns' names, but cannot be read.
+        It is no text, has decimal commas, holds motions, no poses, or is one of true positions by its columns' names,
+        but cannot be read.
     """
     # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
@@ -405,8 +404,10 @@ def table_kind(path: Path, pairs: int) -> str:
         )
     named = "times" if "time" in path.stem.lower() else ""
     try:
-        table = projected(read_table(path, "table"))
-    except InputError:
+        table = table_of_motion(path, "table")
+    except InputError as error:
+        if error.code == "RIL-775":
+            raise
         return named
     row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
@@ -419,7 +420,7 @@ def table_kind(path: Path, pairs: int) -> str:
         return "truth"
     if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
         return "truth"
-    positions = positions_of(table, "csv", {}) if names_positions(table) else None
+    positions = positions_of(table, "csv", {}) if meanings(table).keys() >= {"x", "y"} else None
     # Without times or names of images there must be one for each pair.
     if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
@@ -430,6 +431,7 @@ def table_kind(path: Path, pairs: int) -> str:
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
-    if row.size == 1 and (rows == pairs or named):
+    # Beside times of exposure or numbers of frames, as in times.txt of DSO.
+    if (row.size == 1 and rows == pairs) or (row.size <= 3 and named):
         return "times"
     return ""

@@ -123,7 +123,23 @@ class TimedPoses:
 def read_motion(path: Path, format: str = "auto") -> TextTable:
     """The table of a file of poses or positions in any form (see module), in metres where it has degrees of places."""
     images = of_images(path) if format in ("auto", "colmap") else None
-    return projected(read_table(path, "pose file")) if images is None else images
+    return table_of_motion(path, "pose file") if images is None else images
+
+
+def table_of_motion(path: Path, what: str) -> TextTable:
+    """The table in a file, called ``what`` in errors, with its places :func:`projected`.
+
+    Raises
+    ------
+    InputError
+        It holds motions from one row's time to the next one's, which are no poses.
+    """
+    table = read_table(path, what)
+    first, second = (table.text(k) if "time" in "".join(table.header[k : k + 1]) else [] for k in (0, 1))
+    if second[1:] and (first[1:] == second[:-1] or second[1:] == first[:-1]):
+        text = f"{path} holds motions from one time to another ({table.header[0]}, {table.header[1]}), no poses"
+        raise InputError("RIL-775", text, remedy="chain them, and write time x y z qx qy qz qw a line (tum)")
+    return projected(table)
 
 
 def projected(table: TextTable) -> TextTable:
@@ -337,11 +353,6 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
         stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
-
-
-def names_positions(table: TextTable) -> bool:
-    """Whether columns are named as x and y, or east and north; of a :func:`projected` table as degrees, too."""
-    return {"x", "y"} <= meanings(table).keys()
 
 
 def _column(table: TextTable, stated: str | int) -> int:

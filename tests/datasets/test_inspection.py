@@ -244,6 +244,7 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["east north", "1 2", "3 4", "5 6"], ""),
         (["0.0", "0.5"], "times"),
         (["0.0", "0.5", "1.0"], ""),
+        (["00000 1600000000.1 5.0", "00001 1600000000.2 5.0"], ""),
         (["hello", "1 of these"], ""),
         ([], ""),
     ],
@@ -251,6 +252,12 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
 def test_tables_are_told_by_content(tmp_path, lines, kind):
     write_lines(tmp_path / "table.txt", lines)
     assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+@pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
+def test_times_stand_in_a_file_that_is_called_so(tmp_path, row):
+    write_lines(tmp_path / "times.txt", [row.format(k, 1600000000 + k) for k in range(4)])
+    assert table_kind(tmp_path / "times.txt", 2) == "times"
 
 
 def test_poses_with_cells_of_text_are_found(tmp_path):

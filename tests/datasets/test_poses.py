@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
+from rille.datasets.inspection import table_kind
 from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -338,6 +339,16 @@ def test_positions_of_rtklib(tmp_path):
     path.write_text(text.format("x-ecef", "y-ecef", "z-ecef"))
     with raises("RIL-805", "UTM"):
         positions_of(read_motion(path), "auto", {})
+
+
+@pytest.mark.parametrize("steps", ["{1},{0}", "{0},{1}"])
+def test_motions_from_frame_to_frame_are_no_poses(tmp_path, steps):
+    """As RobotCar has them in vo.csv."""
+    rows = [steps.format(100 + k, 101 + k) + ",1,0,0,0,0,0.1" for k in range(3)]
+    (tmp_path / "vo.csv").write_text("\n".join(["source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw", *rows]))
+    for read in (read_motion, lambda path: table_kind(path, 3)):
+        with raises("RIL-775", "vo.csv", "destination_timestamp"):
+            read(tmp_path / "vo.csv")
 
 
 @pytest.mark.parametrize("south", [1, -1])
