@@ -64,7 +64,7 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
 
 
 def _thinned(parts: Iterator[Columns], voxel: float, origin: Floats) -> Iterator[Columns]:
-    """Points of each pair after thinning; ``origin`` (3,): of the world, m, since 0 on Earth is millions of cubes away."""
+    """Points of each pair after thinning; cubes count from ``origin`` (3,), m: from 0 on Earth there are too many."""
     taken = np.zeros(0, np.int64)
     for columns in parts:
         cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]) - origin, voxel)
