@@ -406,7 +406,7 @@ def table_kind(path: Path, pairs: int) -> str:
     try:
         table = table_of_motion(path, "table")
     except InputError as error:
-        if error.code == "RIL-775":
+        if error.code in ("RIL-775", "RIL-979"):
             raise
         return named
     row = table.values(range(table.columns))[0]
@@ -414,11 +414,11 @@ def table_kind(path: Path, pairs: int) -> str:
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
-    if "yaw" in header and "roll" in header:
+    if "yaw" in header and "roll" in header and not table.crs:
         return "attitude"
     if untimed(table) and len(table.rows) == pairs:
         return "truth"
-    if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
+    if matrix_at(table) is not None or (meanings(table).keys() >= {"x", "y", *QUATERNION} and not table.crs):
         return "truth"
     positions = positions_of(table, "csv", {}) if meanings(table).keys() >= {"x", "y"} else None
     # Without times or names of images there must be one for each pair.

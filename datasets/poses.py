@@ -62,7 +62,7 @@ WITHIN = 1e-6
 WORDS = (
     (
         re.compile(
-            r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
+            r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
         ),
         lambda m: "time",
     ),
@@ -72,15 +72,15 @@ WORDS = (
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"theta"), lambda m: "yaw"),
-    # RTKLIB has baselines from the reference station, Metashape X/Easting.
-    (re.compile(r"(?:utm[_. ]?|x/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
-    (re.compile(r"(?:utm[_. ]?|y/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
-    (re.compile(r"(?:z/)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"), lambda m: "z"),
+    # RTKLIB has baselines from the reference station, Metashape X/Easting, PlotJuggler /fix/altitude.
+    (re.compile(r"(?:utm[_. ]?|.*/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
+    (re.compile(r"(?:utm[_. ]?|.*/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
+    (re.compile(r"(?:.*/)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"), lambda m: "z"),
     (re.compile(r"(?:.*[./_ ])?lat(?:itude)?"), lambda m: "lat"),
     (re.compile(r"(?:.*[./_ ])?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
 )
 
-DOWNWARDS = re.compile(r"down|depth")
+DOWNWARDS = re.compile(r"(.*/)?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
 
@@ -283,7 +283,8 @@ def positions_of(
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
     posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
-    if not columns and posed:
+    # Beside degrees nothing says in which frame angles are.
+    if not columns and posed and not table.crs:
         return None
     degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
     if len(known) < 2 or (degrees and not table.crs):
@@ -314,8 +315,8 @@ def unread_rotations(table: TextTable) -> tuple[str, ...]:
     named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
     if not named:
         return ()
-    columns = f"its columns {', '.join(named)} are no rotations that are known"
-    write = "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
+    columns = f"its columns {', '.join(named)} are no rotations about known axes"
+    write = "for poses write places in metres, and qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
     return (warning("RIL-749", f"{table.name}: its positions alone are read; {columns}: {write}"),)
 
 

@@ -238,6 +238,7 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["time,roll_deg,pitch_deg,yaw_deg", "0,1,2,3"], "attitude"),
         (["time,x,y", "0,1,2", "1,2,3"], "positions"),
         (["time,latitude,longitude,altitude", "0,48,9,2"], "positions"),
+        (["time,lat,lon,alt,roll,pitch,yaw", "0,48,9,2,0.1,0.2,3"], "positions"),
         (["#Label,X/Longitude,Y/Latitude,Z/Altitude", *(f"0{k}.jpg,9,48,2" for k in range(4))], "positions"),
         (["image,easting,northing", *(f"img_{k}.jpg,9,48" for k in range(4))], "positions"),
         (["east north", "1 2", "3 4"], "positions"),
@@ -258,6 +259,12 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
 def test_times_stand_in_a_file_that_is_called_so(tmp_path, row):
     write_lines(tmp_path / "times.txt", [row.format(k, 1600000000 + k) for k in range(4)])
     assert table_kind(tmp_path / "times.txt", 2) == "times"
+
+
+def test_what_is_known_and_not_read_is_told(tmp_path):
+    write_lines(tmp_path / "gps.txt", ["$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"])
+    with raises("RIL-979", "NMEA", "latitude"):
+        table_kind(tmp_path / "gps.txt", 2)
 
 
 def test_poses_with_cells_of_text_are_found(tmp_path):

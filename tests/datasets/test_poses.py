@@ -358,6 +358,8 @@ def test_motions_from_frame_to_frame_are_no_poses(tmp_path, steps):
         ("time,latitude,longitude,altitude", "{k},{lat},{lon},7"),
         ("#Label,X/Longitude,Y/Latitude,Z/Altitude", "img{k}.jpg,{lon},{lat},7"),
         ("time [s];GPS_Lat [deg];gps lng;height", "{k};{lat};{lon};7"),
+        ("__time,/fix/latitude,/fix/longitude,/fix/altitude", "{k},{lat},{lon},7"),
+        ("time,lat,lon,/imu/depth,roll,pitch,yaw", "{k},{lat},{lon},-7,1,2,3"),
     ],
 )
 def test_degrees_become_metres_of_the_zone_of_the_first_place(tmp_path, names, row, south):
