@@ -30,7 +30,7 @@ ABOUT = {
 }
 """Descriptions of the columns that LAS does not define, at most 32 characters each."""
 
-PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "uint"}
+PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "int"}  # Open3D reads no uint
 
 Columns = Mapping[str, NDArray[Any]]
 

@@ -122,6 +122,7 @@ def test_trimesh_reads_the_same_points(tmp_path: Path, place: Georeference | Non
     np.testing.assert_allclose(cloud.vertices, position if place is None else place.apply(position), atol=2e-6)
     np.testing.assert_array_equal(cloud.colors[:, 0], 10 * pair)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "property int pair" in header  # Open3D leaves out what is uint
     crs = pyproj.CRS.from_wkt(header.split("comment crs ")[1].splitlines()[0])
     assert crs.is_engineering if place is None else crs.to_epsg() == 32633
 
