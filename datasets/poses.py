@@ -120,13 +120,13 @@ class TimedPoses:
     images: tuple[str, ...] = ()
 
 
-def read_motion(path: Path, format: str = "auto") -> TextTable:
-    """The table of a file of poses or positions in any form (see module), in metres where it has degrees of places."""
+def read_motion(path: Path, format: str = "auto", crs: str = "") -> TextTable:
+    """The table of a file of poses or positions in any form (see module), its places :func:`projected`."""
     images = of_images(path) if format in ("auto", "colmap") else None
-    return table_of_motion(path, "pose file") if images is None else images
+    return table_of_motion(path, "pose file", crs) if images is None else images
 
 
-def table_of_motion(path: Path, what: str) -> TextTable:
+def table_of_motion(path: Path, what: str, crs: str = "") -> TextTable:
     """The table in a file, called ``what`` in errors, with its places :func:`projected`.
 
     Raises
@@ -139,14 +139,14 @@ def table_of_motion(path: Path, what: str) -> TextTable:
     if second[1:] and (first[1:] == second[:-1] or second[1:] == first[:-1]):
         text = f"{path} holds motions from one time to another ({table.header[0]}, {table.header[1]}), no poses"
         raise InputError("RIL-775", text, remedy="chain them, and write time x y z qx qy qz qw a line (tum)")
-    return projected(table)
+    return projected(table, crs)
 
 
-def projected(table: TextTable) -> TextTable:
-    """The table with easting and northing in the columns of longitude and latitude, in the UTM zone of its first place.
+def projected(table: TextTable, crs: str) -> TextTable:
+    """The table with easting and northing, m, in the columns of longitude and latitude.
 
-    Rows without a place (no number, or 0 and 0) have NaN there. Unchanged if no row has degrees, or columns of metres
-    stand beside them.
+    In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
+    have NaN there. Unchanged if no row has degrees, or columns of metres stand beside them.
     """
     meant = meanings(table)
     if not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}:
@@ -160,7 +160,7 @@ def projected(table: TextTable) -> TextTable:
     if not there.any():
         return table
     longitude, latitude = degrees[there][0]
-    crs = f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
+    crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
     places = np.full(degrees.shape, np.nan)
     places[there] = np.transpose(transform("OGC:CRS84", crs, *degrees[there].T))
     cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
@@ -334,7 +334,7 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
 
 def _of_degrees(table: TextTable) -> tuple[str, ...]:
     """Warning about coordinates that are :func:`projected`."""
-    text = f"{table.name}: latitude and longitude are projected to UTM, {table.crs}"
+    text = f"{table.name}: latitude and longitude are projected to {table.crs}"
     return (warning("RIL-774", text),) if table.crs else ()
 
 

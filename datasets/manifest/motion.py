@@ -59,12 +59,14 @@ class MotionReader:
     pairs : of images; some may lack a file.
     sequence : with the records read so far; times come first, by which the others are interpolated.
     growing : whether images are still arriving, so that a table may have rows for later ones.
+    crs : to which degrees of latitude and longitude are projected; empty: UTM.
     """
 
     root: Path
     pairs: Sequence[ImagePair]
     sequence: protocol.Sequence
     growing: bool = False
+    crs: str = ""
 
     def read(self, manifest: Manifest) -> protocol.Sequence:
         """The sequence with what the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu``
@@ -188,7 +190,7 @@ class MotionReader:
     def poses(self, section: PoseFile | Attitude, table: str, read: TextTable | None = None) -> Poses:
         """T_reference_left of each pair from a file of a body's poses, which may have been ``read`` before."""
         path = self.root / section.file
-        rows = read or read_motion(path, section.format)
+        rows = read or read_motion(path, section.format, self.crs)
         timed = poses_of(rows, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
         self.warn(timed.warnings)
         poses: Poses = timed.poses
@@ -257,7 +259,7 @@ class MotionReader:
 
     def truth(self, section: Truth) -> None:
         """Read true poses of each pair, or true positions with their own times."""
-        rows = read_motion(self.root / section.file, section.format)
+        rows = read_motion(self.root / section.file, section.format, self.crs)
         alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
@@ -340,15 +342,16 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        found = positions_of(read_motion(self.root / section.file), "auto", section.columns, section.unit)
+        rows = read_motion(self.root / section.file, crs=self.crs)
+        found = positions_of(rows, "auto", section.columns, section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
-        rows, times = self.positions(section, found, "positions")
+        places, times = self.positions(section, found, "positions")
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
         measured = {
-            "positions": [list(row) for row in rows],
-            "times": list(times or self.sequence.times or range(len(rows))),
+            "positions": [list(place) for place in places],
+            "times": list(times or self.sequence.times or range(len(places))),
             "sigma": sigma,
             "lever": list(section.lever_arm),
         }

@@ -922,7 +922,12 @@ def test_positions_in_degrees_are_read_in_metres(tmp_path, more):
     s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'))
     (x, y), (x1, y1) = s.priors["positions"]["positions"]
     assert (x1 - x, y1 - y) == (pytest.approx(0.744, abs=0.002), pytest.approx(0, abs=1e-3))
-    assert [line for line in s.warnings if "RIL-774" in line]
+    assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32632" in line]
+    world = '[world]\ncrs = "EPSG:32633"\norigin = [1e3, 2e3, 0]\nazimuth_deg = 0\n'
+    text = f'{TIMED}{world}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'
+    s = opened(write_sequence(tmp_path, text))
+    assert s.priors["positions"]["positions"][0][0] < 100e3  # six degrees west of the middle of its zone
+    assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32633" in line]
 
 
 NAMED = ["left/02.png,3,30", "left/00.png,1,10", "right/01.png,9,9", "left/01.png,2,20"]
