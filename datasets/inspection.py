@@ -406,7 +406,7 @@ def table_kind(path: Path, pairs: int) -> str:
     try:
         table = table_of_motion(path, "table")
     except InputError as error:
-        if error.code in ("RIL-775", "RIL-979"):
+        if error.code in ("RIL-775", "RIL-776", "RIL-979"):
             raise
         return named
     row = table.values(range(table.columns))[0]

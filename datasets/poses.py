@@ -147,6 +147,11 @@ def projected(table: TextTable, crs: str) -> TextTable:
 
     In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
     have NaN there. Unchanged if no row has degrees, or columns of metres stand beside them.
+
+    Raises
+    ------
+    InputError
+        A place lies where ``crs`` has none.
     """
     meant = meanings(table)
     if not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}:
@@ -162,7 +167,10 @@ def projected(table: TextTable, crs: str) -> TextTable:
     longitude, latitude = degrees[there][0]
     crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
     places = np.full(degrees.shape, np.nan)
-    places[there] = np.transpose(transform("OGC:CRS84", crs, *degrees[there].T))
+    try:
+        places[there] = np.transpose(transform("OGC:CRS84", crs, *degrees[there].T))
+    except Exception as error:  # GDAL's have no public class
+        raise InputError("RIL-776", f"{table.name} has places beyond {crs}", remedy="correct or remove them") from error
     cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
     rows = tuple(tuple((dict(enumerate(row)) | of).values()) for row, of in zip(table.rows, cells, strict=True))
     header = tuple(unitless(name) if k in at else name for k, name in enumerate(table.header))

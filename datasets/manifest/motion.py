@@ -342,8 +342,7 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        rows = read_motion(self.root / section.file, crs=self.crs)
-        found = positions_of(rows, "auto", section.columns, section.unit)
+        found = positions_of(read_motion(self.root / section.file, crs=self.crs), "auto", section.columns, section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")

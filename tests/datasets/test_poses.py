@@ -378,6 +378,12 @@ def test_degrees_become_metres_of_the_zone_of_the_first_place(tmp_path, names, r
     assert sum("RIL-706" in line for line in found.warnings) == 1
 
 
+def test_places_all_around_the_earth_make_no_plane(tmp_path):
+    (tmp_path / "p.csv").write_text("time,latitude,longitude\n0,48,9\n1,0,99\n")
+    with raises("RIL-776", "EPSG:32632"):
+        read_motion(tmp_path / "p.csv")
+
+
 @pytest.mark.parametrize("row", ["0,4806.1,930.2", "0,lost,9"])
 def test_what_is_no_degree_is_no_place(tmp_path, row):
     """Degrees and minutes, as in sentences of NMEA."""
