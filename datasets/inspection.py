@@ -29,12 +29,13 @@ from rille.datasets.poses import (
     matrix_at,
     meanings,
     of_images,
+    of_poses,
     positions_of,
-    table_of_motion,
     untimed,
 )
 from rille.datasets.text.count import count
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
+from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
@@ -404,11 +405,10 @@ def table_kind(path: Path, pairs: int) -> str:
         )
     named = "times" if "time" in path.stem.lower() else ""
     try:
-        table = table_of_motion(path, "table")
-    except InputError as error:
-        if error.code in ("RIL-775", "RIL-776", "RIL-979"):
-            raise
+        table = read_table(path, "table")
+    except InputError:
         return named
+    table = of_poses(table)
     row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")

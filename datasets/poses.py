@@ -123,21 +123,20 @@ class TimedPoses:
 def read_motion(path: Path, format: str = "auto", crs: str = "") -> TextTable:
     """The table of a file of poses or positions in any form (see module), its places :func:`projected`."""
     images = of_images(path) if format in ("auto", "colmap") else None
-    return table_of_motion(path, "pose file", crs) if images is None else images
+    return of_poses(read_table(path, "pose file"), crs) if images is None else images
 
 
-def table_of_motion(path: Path, what: str, crs: str = "") -> TextTable:
-    """The table in a file, called ``what`` in errors, with its places :func:`projected`.
+def of_poses(table: TextTable, crs: str = "") -> TextTable:
+    """The table with its places :func:`projected`.
 
     Raises
     ------
     InputError
         It holds motions from one row's time to the next one's, which are no poses.
     """
-    table = read_table(path, what)
     first, second = (table.text(k) if "time" in "".join(table.header[k : k + 1]) else [] for k in (0, 1))
     if second[1:] and (first[1:] == second[:-1] or second[1:] == first[:-1]):
-        text = f"{path} holds motions from one time to another ({table.header[0]}, {table.header[1]}), no poses"
+        text = f"{table.name} holds motions from one time to another ({table.header[0]}, {table.header[1]}), no poses"
         raise InputError("RIL-775", text, remedy="chain them, and write time x y z qx qy qz qw a line (tum)")
     return projected(table, crs)
 

@@ -261,12 +261,6 @@ def test_times_stand_in_a_file_that_is_called_so(tmp_path, row):
     assert table_kind(tmp_path / "times.txt", 2) == "times"
 
 
-def test_what_is_known_and_not_read_is_told(tmp_path):
-    write_lines(tmp_path / "gps.txt", ["$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"])
-    with raises("RIL-979", "NMEA", "latitude"):
-        table_kind(tmp_path / "gps.txt", 2)
-
-
 def test_poses_with_cells_of_text_are_found(tmp_path):
     """As ROS 2 writes them."""
     names = [*(f"p.position.{a}" for a in "xyz"), *(f"p.orientation.{a}" for a in "xyzw")]
