@@ -22,9 +22,17 @@ from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
-from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, side_of, stamp_of, writable
+from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import QUATERNION, matrix_at, meanings, names_positions, of_images, positions_of, untimed
+from rille.datasets.poses import (
+    QUATERNION,
+    matrix_at,
+    meanings,
+    of_images,
+    of_poses,
+    positions_of,
+    untimed,
+)
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -59,7 +67,7 @@ class FoundImages:
     sizes : of the left and of the right images, if all of a side have the same.
     why : how left and right were recognised.
     trouble : why the images cannot be paired; empty: they can.
-    stamped : whether the file names are times since an epoch.
+    stamped : whether the left images' names are times, since 1970 or as date and time of day.
     sides : the words or letters in the names that mark left and right.
     absent : missing files of pairs, which are counted in ``pairs``.
     lines : on the pairing by time stamps in the names, if these differ.
@@ -282,7 +290,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {sides[0]!r} and {sides[1]!r}",
         trouble,
-        all(stamp_of(path.stem) for path in left),
+        bool(pairing.times_in_names([pair.left for pair in matched])),
         sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),
@@ -302,7 +310,7 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             header = common_header(images[:1]).header
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
-    return InputError("RIL-194", text, remedy=remedy)
+    return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 
 def _place(path: Path, without: str) -> str:
@@ -402,7 +410,8 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It is no text, has decimal commas, or is one of true positions by its columns' names, but cannot be read.
+        It is no text, has decimal commas, holds motions, no poses, or is one of true positions by its columns' names,
+        but cannot be read.
     """
     # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
@@ -416,20 +425,21 @@ def table_kind(path: Path, pairs: int) -> str:
         table = read_table(path, "table")
     except InputError:
         return named
+    table = of_poses(table)
     row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
-    if "yaw" in header and "roll" in header:
+    if "yaw" in header and "roll" in header and not table.crs:
         return "attitude"
     if untimed(table) and len(table.rows) == pairs:
         return "truth"
-    if matrix_at(table) is not None or meanings(table).keys() >= {"x", "y", *QUATERNION}:
+    if matrix_at(table) is not None or (meanings(table).keys() >= {"x", "y", *QUATERNION} and not table.crs):
         return "truth"
-    positions = positions_of(table, "csv", {}) if names_positions(table) else None
-    # Without times there must be one for each pair.
-    if positions is not None and (positions.times is not None or len(positions.positions) == pairs):
+    positions = positions_of(table, "csv", {}) if meanings(table).keys() >= {"x", "y"} else None
+    # Without times or names of images there must be one for each pair.
+    if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
     # Names of images, dates and the like are no numbers.
     return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
@@ -438,6 +448,7 @@ def table_kind(path: Path, pairs: int) -> str:
 def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
-    if row.size == 1 and (rows == pairs or named):
+    # Beside times of exposure or numbers of frames, as in times.txt of DSO.
+    if (row.size == 1 and rows == pairs) or (row.size <= 3 and named):
         return "times"
     return ""

@@ -11,8 +11,8 @@ Forms of a file, one pose T_reference_body per row:
 * ``colmap``: ``images.txt`` of a text model, two lines for each image: number, quaternion w x y z and translation from
   the world to the camera, the camera's number and the image's name; then its points, which are skipped.
 
-Truth may be positions alone (:func:`positions_of`): columns x, y and perhaps time and z, by name or as the manifest
-states.
+Truth may be positions alone (:func:`positions_of`): columns x, y and perhaps time (or, as the first, names of images)
+and z, by name or as the manifest states.
 
 Angles are those of vehicles: R_reference_body = Rz(yaw) Ry(pitch) Rx(roll). Missing coordinates and angles are 0.
 """
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ WITHIN = 1e-6
 WORDS = (
     (
         re.compile(
-            r"((gps|utc)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
+            r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
         ),
         lambda m: "time",
     ),
@@ -71,13 +71,15 @@ WORDS = (
     (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
     (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
     (re.compile(r"theta"), lambda m: "yaw"),
-    # RTKLIB has baselines from the reference station.
-    (re.compile(r"(?:utm[_. ]?)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
-    (re.compile(r"(?:utm[_. ]?)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
-    (re.compile(r"up|u-baseline|height|alt|altitude|elevation|down|depth"), lambda m: "z"),
+    # RTKLIB has baselines from the reference station, Metashape X/Easting, PlotJuggler /fix/altitude.
+    (re.compile(r"(?:utm[_. ]?|.*/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
+    (re.compile(r"(?:utm[_. ]?|.*/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
+    (re.compile(r"(?:.*/)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"), lambda m: "z"),
+    (re.compile(r"(?:.*[./_ ])?lat(?:itude)?"), lambda m: "lat"),
+    (re.compile(r"(?:.*[./_ ])?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
 )
 
-DOWNWARDS = re.compile(r"down|depth")
+DOWNWARDS = re.compile(r"(.*/)?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
 
@@ -117,10 +119,60 @@ class TimedPoses:
     images: tuple[str, ...] = ()
 
 
-def read_motion(path: Path, format: str = "auto") -> TextTable:
-    """The table of a file of poses or positions in any form (see module)."""
+def read_motion(path: Path, format: str = "auto", crs: str = "") -> TextTable:
+    """The table of a file of poses or positions in any form (see module), its places :func:`projected`."""
     images = of_images(path) if format in ("auto", "colmap") else None
-    return read_table(path, "pose file") if images is None else images
+    return of_poses(read_table(path, "pose file"), crs) if images is None else images
+
+
+def of_poses(table: TextTable, crs: str = "") -> TextTable:
+    """The table with its places :func:`projected`.
+
+    Raises
+    ------
+    InputError
+        It holds motions from one row's time to the next one's, which are no poses.
+    """
+    first, second = (table.text(k) if "time" in "".join(table.header[k : k + 1]) else [] for k in (0, 1))
+    if second[1:] and (first[1:] == second[:-1] or second[1:] == first[:-1]):
+        text = f"{table.name} holds motions from one time to another ({table.header[0]}, {table.header[1]}), no poses"
+        raise InputError("RIL-775", text, remedy="chain them, and write time x y z qx qy qz qw a line (tum)")
+    return projected(table, crs)
+
+
+def projected(table: TextTable, crs: str) -> TextTable:
+    """The table with easting and northing, m, in the columns of longitude and latitude.
+
+    In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
+    have NaN there. Unchanged if no row has degrees, or columns of metres stand beside them.
+
+    Raises
+    ------
+    InputError
+        A place lies where ``crs`` has none.
+    """
+    meant = meanings(table)
+    if not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}:
+        return table
+    from rasterio import warp
+
+    transform: Any = warp.transform
+    at = [meant["lon"], meant["lat"]]
+    degrees = table.values(at)
+    there = (np.abs(degrees) <= (180, 90)).all(axis=1) & degrees.any(axis=1)
+    if not there.any():
+        return table
+    longitude, latitude = degrees[there][0]
+    crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
+    places = np.full(degrees.shape, np.nan)
+    try:
+        places[there] = np.transpose(transform("OGC:CRS84", crs, *degrees[there].T))
+    except Exception as error:  # GDAL's have no public class
+        raise InputError("RIL-776", f"{table.name} has places beyond {crs}", remedy="correct or remove them") from error
+    cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
+    rows = tuple(tuple((dict(enumerate(row)) | of).values()) for row, of in zip(table.rows, cells, strict=True))
+    header = tuple(unitless(name) if k in at else name for k, name in enumerate(table.header))
+    return replace(table, rows=rows, header=header, crs=crs)
 
 
 def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) -> TimedPoses:
@@ -147,7 +199,7 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
     if format == "kitti" or (format == "auto" and shaped and not _whole(meant)):
         return _of_matrices(table, 1.0 if unit is None else unit, timed=first == 1)
     columns = _columns(table, format, meant)
-    warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
+    warnings, quaternion = _of_degrees(table), columns.keys() >= set(QUATERNION)
     if "time" in columns:
         lost = np.zeros(len(table.rows), bool)
         if quaternion:
@@ -155,7 +207,8 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
             lost |= ~np.any(table.values([columns[q] for q in QUATERNION]), axis=1)
         if quaternion and columns.keys() >= set(POSITION):
             lost |= _at_origin(table.values([columns[name] for name in (*POSITION, "qx", "qy", "qz")]))
-        table, warnings = table.measured(list(columns.values()), lost)
+        table, left_out = table.measured(list(columns.values()), lost)
+        warnings += left_out
     times = times_of(table, columns["time"]) if "time" in columns else None
     poses = _posed(table, columns, unit)
     warnings += _rounded(np.array([pose.translation for pose in poses]), table.name)
@@ -202,12 +255,13 @@ def of_images(path: Path) -> TextTable | None:
 
 @dataclass(frozen=True)
 class TimedPositions:
-    """Positions of a file, x, y or x, y, z, m, one a row, and their times, s; see :class:`TimedPoses`."""
+    """Positions of a file, x, y or x, y, z, m, one a row, their times, s, or their images; see :class:`TimedPoses`."""
 
     times: tuple[float, ...] | None
     positions: tuple[tuple[float, ...], ...]
     name: str
     warnings: tuple[str, ...]
+    images: tuple[str, ...] = ()
 
 
 def positions_of(
@@ -217,6 +271,7 @@ def positions_of(
 
     Parameters
     ----------
+    table : degrees of latitude and longitude are :func:`projected` before.
     columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, unless the table's names are clear; with any of
         them the table is one of positions.
     unit : as for :func:`poses_of`.
@@ -234,24 +289,29 @@ def positions_of(
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
     posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
-    if not columns and posed:
+    # Beside degrees nothing says in which frame angles are.
+    if not columns and posed and not table.crs:
         return None
-    if len(known) < 2 or any(NOT_IN_PLANE.search(table.header[meant[axis]]) for axis in known if table.header):
+    degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
+    if len(known) < 2 or (degrees and not table.crs):
         names = ", ".join(table.header) or f"{table.columns} without names"
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
         if any(map(NOT_IN_PLANE.search, table.header)):
-            remedy = "project them to metres in a plane, as UTM has them (easting, northing), in columns x and y"
+            remedy = "give degrees in columns latitude and longitude, or metres in a plane, as UTM has them (easting, "
+            remedy += "northing), in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     placed = [meant["x"], meant["y"]]
     placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
-    times, warnings = None, tuple[str, ...]()
-    if "time" in meant:  # else rows are pairs
-        table, warnings = table.measured([meant["time"], *placed], _without_fix(table, *placed[:2]))
-        times = times_of(table, meant["time"])
+    timed = [meant["time"]] if "time" in meant else []
+    named, warnings = not timed and bool(np.isinf(table.values([0])).all()), _of_degrees(table)
+    if timed or named:  # else rows are pairs
+        table, left_out = table.measured([*timed, *placed], _without_fix(table, *placed[:2]))
+        warnings += left_out
     rows = _lengths(table, placed, unit)
     warnings += _rounded(rows, table.name)
-    return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings)
+    times, images = times_of(table, *timed) if timed else None, tuple(table.text(0)) if named else ()
+    return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings, images)
 
 
 def unread_rotations(table: TextTable) -> tuple[str, ...]:
@@ -261,8 +321,8 @@ def unread_rotations(table: TextTable) -> tuple[str, ...]:
     named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
     if not named:
         return ()
-    columns = f"its columns {', '.join(named)} are no rotations that are known"
-    write = "for poses write columns qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
+    columns = f"its columns {', '.join(named)} are no rotations about known axes"
+    write = "for poses write places in metres, and qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
     return (warning("RIL-749", f"{table.name}: its positions alone are read; {columns}: {write}"),)
 
 
@@ -276,6 +336,12 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
         return ()
     line = f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0"
     return (warning("RIL-709", f"{line}: write them in double precision, or less a constant"),)
+
+
+def _of_degrees(table: TextTable) -> tuple[str, ...]:
+    """Warning about coordinates that are :func:`projected`."""
+    text = f"{table.name}: latitude and longitude are projected to {table.crs}"
+    return (warning("RIL-774", text),) if table.crs else ()
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
@@ -294,11 +360,6 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
         stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
-
-
-def names_positions(table: TextTable) -> bool:
-    """Whether columns are named as x and y, or east and north."""
-    return {"x", "y"} <= meanings(table).keys()
 
 
 def _column(table: TextTable, stated: str | int) -> int:
@@ -322,7 +383,7 @@ def meanings(table: TextTable) -> dict[str, int]:
         matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
         meant = next((meaning(match) for match, meaning in matches if match), None)
         if meant is not None:
-            columns.setdefault(meant, k)
+            columns.setdefault({"lat": "y", "lon": "x"}.get(meant, meant) if table.crs else meant, k)
     return columns
 
 

@@ -20,6 +20,7 @@ from rille.datasets.images.files import Digests
 from rille.datasets.images.kinds import hints
 from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
+from rille.datasets.images.pairing import of_one_camera
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
@@ -153,8 +154,8 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "; ".join([*hints(name_or_path), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
-    remedy = f"`rille init {shlex.quote(name_or_path)}` writes a manifest; `rille datasets list` names what opens "
-    remedy += "without one"
+    remedy = f"{of_one_camera(path)}`rille init {shlex.quote(name_or_path)}` writes a manifest; "
+    remedy += "`rille datasets list` names what opens without one"
     if beside.is_file():
         remedy = f"give its manifest, {beside}"
     elif bags := [entry.path for entry in Search().entries(path) if is_bag(Path(entry.path))]:

@@ -218,6 +218,7 @@ class Run:
         """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
 
         y falls: ``terrain.sel(y=slice(0.6, 0.4))``. ``terrain.to_netcdf(path)`` and ``terrain.to_zarr(path)`` save it.
+        Its arrays are dask's, read in parts; ``terrain.load()`` takes them into memory, as medians and quantiles need.
 
         Raises
         ------

@@ -18,10 +18,11 @@ from rille.stages.core.errors import InputError
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
-    "OpenCV (YAML, XML), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, "
-    "mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, Middlebury calib.txt, KITTI, "
-    "K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read; of another program write fx, fy, "
-    "cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R transposed), as OpenCV's YAML"
+    "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
+    "camodocal, VINS, Basalt, mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, "
+    "Middlebury calib.txt, KITTI, K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read; of "
+    "another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
+    "transposed), as OpenCV's YAML"
 )
 
 Text: TypeAlias = Callable[[str], bool]

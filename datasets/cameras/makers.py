@@ -77,16 +77,18 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
 
 
 def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """The two cameras that the device rectifies for stereo. Lengths in the file are centimetres, here metres.
+    """The two cameras that the device rectifies for stereo, or at sockets B and C where the file does not name them.
 
-    ``extrinsics`` map a camera to the one at ``toCameraSocket``; 14 coefficients are OpenCV's, the first four a
-    fisheye's.
+    Lengths in the file are centimetres, here metres. ``extrinsics`` map a camera to the one at ``toCameraSocket``; 14
+    coefficients are OpenCV's, the first four a fisheye's.
     """
     rows = f.get("cameraData")
     pairs = [row for row in rows if isinstance(row, list) and len(row) == 2] if isinstance(rows, list) else []
     sockets = Fields({str(socket): camera for socket, camera in pairs}, f.file, "cameraData ")
-    stereo = f.sub("stereoRectificationData")
-    sides = [stereo.text(f"{side}CameraSocket") for side in ("left", "right")]
+    stereo = f.sub("stereoRectificationData") if "stereoRectificationData" in f else Fields({}, f.file)
+    sides = tuple(stereo.text(f"{side}CameraSocket", "-1") for side in ("left", "right"))
+    if "-1" in sides:  # as of boards that rectify nothing
+        sides = ("CAM_B", "CAM_C") if "CAM_B" in sockets else ("1", "2")
     left, right = (_depthai_lens(sockets.sub(side)) for side in sides)
     (root, T_root_left), (other, T_root_right) = (_to_root(sockets, side) for side in sides)
     if root != other:

@@ -104,7 +104,7 @@ def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
     # 4.0: distance from the centre over that with columns and rows exchanged above which these are exchanged.
     if off > max(4.0 * exchanged, 0.5 * MAX_OFF_CENTRE * width):
         text = f"the principal point ({c.cx:g}, {c.cy:g}) px of camera {camera.name} would be the centre of"
-        remedy = "exchange them; or, if the images were turned, turn them back"
+        remedy = "exchange them; or, if the images were turned, turn them back (by a tag: magick mogrify -auto-orient)"
         raise InputError("RIL-133", f"{text} {width} x {height} images if cx and cy were exchanged", remedy=remedy)
 
 

@@ -353,7 +353,8 @@ def check_size(found: Header, wanted: Header, name: str) -> None:
 def _unlike(found: Header, wanted: Header, name: str) -> InputError:
     words = [f"{w} x {h}, {d} bits" for w, h, d in (found, wanted)]
     text = f"{name} is {words[0]}; others of its camera are {words[1]}"
-    remedy = "all images of a camera must have one size and depth; leave the frame out or convert it"
+    remedy = "all images of a camera must have one size and depth: leave the frame out, convert it, or state a pattern "
+    remedy += "without thumbnails in a manifest (IMG_????.jpg)"
     return InputError("RIL-176", text, remedy=remedy)
 
 

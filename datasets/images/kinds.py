@@ -48,6 +48,7 @@ KINDS: dict[str, tuple[str, str]] = {
         ".raw .bin .yuv .bayer",
         "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",
     ),
+    "track": (".gpx .kml .kmz .nmea .ubx", "write it as a table with the names time,latitude,longitude,altitude"),
     "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst", "unpack it"),
     "file": ("", "neither images nor a calibration or table that is known"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -103,15 +104,20 @@ def stamp_of(name: str) -> str:
     return re.sub("[_-]", ".", found[0]) if found else ""
 
 
-def _times(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has one."""
+def times_in_names(paths: Sequence[Path]) -> tuple[float, ...]:
+    """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has its own."""
     stamps = [stamp for path in paths if (stamp := stamp_of(undated(path.stem)))]
     with suppress(InputError):
-        times = seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
-        # Whole seconds tell no pairs. 0.002 s: what increases by a millisecond or less after a date is a counter.
-        coarse = all(map(float.is_integer, times)) or (len(times) > 1 and np.median(np.diff(times)) < 0.002)
-        return () if coarse and not stamp_of(paths[0].stem) else times
+        return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
     return ()
+
+
+def _fine_times(paths: Sequence[Path]) -> tuple[float, ...]:
+    """Times in the names of sorted files that tell pairs; empty if they are too coarse, or there are none."""
+    times = times_in_names(paths)
+    # Whole seconds tell no pairs. 0.002 s: what increases by a millisecond or less after a date is a counter.
+    coarse = all(map(float.is_integer, times)) or (len(times) > 1 and np.median(np.diff(times)) < 0.002)
+    return () if coarse and not stamp_of(paths[0].stem) else times
 
 
 DECIMAL = re.compile(r"(\D*?)((?<!\w)\.\d+|\d+(?:\.\d+)?)(\D*)")
@@ -214,7 +220,8 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
 def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
     """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/A_07 and B/B_07.
 
-    In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside.
+    In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside. Of
+    several one whose words differ by more than a number is taken: A/0, A/1, B/0 and B/1 are two frames of A and of B.
     """
     found = []
     words = [re.split(r"([^\W_]+)", name) for name in names]
@@ -228,7 +235,16 @@ def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
         rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
         if rest[0] == rest[1] and len(rest[0]) > 1:
             found.append(parts)
+    named = [parts for parts in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
+    found = named if found[1:] else found
     return found[0] if len(found) == 1 else {}
+
+
+def of_one_camera(folder: Path) -> str:
+    """Remedy for a folder that is named as the images of one camera; empty for any other."""
+    both = shlex.quote(str(folder.parent if folder.name else folder.resolve().parent))
+    one = f"if {folder} holds the images of one camera, give the folder of both: `rille init {both}`; else "
+    return one if side_of(folder.resolve().name) is not None else ""
 
 
 def without_side(stem: str, side: int) -> str:
@@ -278,7 +294,7 @@ def pair_up(
     if _begun_anew(_ascending([names[path] for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
-    joined = join(*times, tolerance) if all(times := (_times(left), _times(right))) else None
+    joined = join(*times, tolerance) if all(times := (_fine_times(left), _fine_times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
     rule = rule if rule != "auto" else _fitting(left, right, names, joined)
     if rule == "order":

@@ -312,7 +312,8 @@ class PositionFile(Recorded):
 
     Attributes
     ----------
-    file : table of time and position, x and y in the plane in metres (easting, northing), and perhaps z up.
+    file : table of time and position, x and y in the plane in metres (easting, northing) or latitude and longitude in
+        degrees, and perhaps z up; in the place of times the first column may have names of left images.
     sigma : m; standard deviation of each coordinate, or of x, y and z.
     lever_arm : m; where the antenna or prism is in the left camera's frame: x right, y down, z ahead.
     columns : names or numbers (from 1) of the columns, as for truth; names that are clear need none.

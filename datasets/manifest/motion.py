@@ -7,7 +7,7 @@ import ntpath
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -59,12 +59,14 @@ class MotionReader:
     pairs : of images; some may lack a file.
     sequence : with the records read so far; times come first, by which the others are interpolated.
     growing : whether images are still arriving, so that a table may have rows for later ones.
+    crs : to which degrees of latitude and longitude are projected; empty: UTM.
     """
 
     root: Path
     pairs: Sequence[ImagePair]
     sequence: protocol.Sequence
     growing: bool = False
+    crs: str = ""
 
     def read(self, manifest: Manifest) -> protocol.Sequence:
         """The sequence with what the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu``
@@ -188,7 +190,7 @@ class MotionReader:
     def poses(self, section: PoseFile | Attitude, table: str, read: TextTable | None = None) -> Poses:
         """T_reference_left of each pair from a file of a body's poses, which may have been ``read`` before."""
         path = self.root / section.file
-        rows = read or read_motion(path, section.format)
+        rows = read or read_motion(path, section.format, self.crs)
         timed = poses_of(rows, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
         self.warn(timed.warnings)
         poses: Poses = timed.poses
@@ -247,11 +249,8 @@ class MotionReader:
         InputError
             The file names none of them, or one twice.
         """
-        known = {PurePosixPath(image).parts: pose for image, pose in zip(timed.images, timed.poses, strict=True)}
-        # By the last parts of the path, as many as in the file: COLMAP's names begin at its folder of images.
-        paths = [pair.left.parts for pair in self.pairs]
-        stated = ([path[k:] for k in range(len(path)) if path[k:] in known] for path in paths)
-        poses = tuple(known[parts[0]] if parts else None for parts in stated)
+        rows = _rows_of_images(timed.images, self.pairs)
+        poses = tuple(None if row is None else timed.poses[row] for row in rows)
         if not any(poses):
             text = f"{timed.name} has poses of {ends([Path(image) for image in timed.images])}, none of a left image"
             left = ends([pair.left for pair in self.pairs])
@@ -260,7 +259,7 @@ class MotionReader:
 
     def truth(self, section: Truth) -> None:
         """Read true poses of each pair, or true positions with their own times."""
-        rows = read_motion(self.root / section.file, section.format)
+        rows = read_motion(self.root / section.file, section.format, self.crs)
         alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
@@ -307,6 +306,8 @@ class MotionReader:
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
         """Positions in metres, and their times (s) by the images' clock; None: one for each pair.
 
+        Rows that begin with names of images are those of the left images of these names.
+
         Raises
         ------
         InputError
@@ -318,9 +319,17 @@ class MotionReader:
             refuse_apart(times, self.sequence.times, found.name)
             return found.positions, times
         rows = found.positions[: len(self.pairs)] if self.growing else found.positions
-        if len(rows) != len(self.pairs):
-            text = f"{table}.file: {section.file} has {len(rows)} positions for {len(self.pairs)} pairs"
-            remedy = "give one a pair, or times of both ([times] of the pairs)"
+        at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
+        clock = None if len(at) == len(self.pairs) else self.sequence.times
+        if at and (clock or len(at) == len(self.pairs)):
+            return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
+        of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
+        if of_images or len(rows) != len(self.pairs):
+            there = f"{len(at)} positions by names of left images" if of_images else f"{len(rows)} positions"
+            text = f"{table}.file: {section.file} has {there} for {len(self.pairs)} pairs"
+            remedy = (
+                "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
+            )
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
 
@@ -333,15 +342,15 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        found = positions_of(read_motion(self.root / section.file), "auto", section.columns, section.unit)
+        found = positions_of(read_motion(self.root / section.file, crs=self.crs), "auto", section.columns, section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
-        rows, times = self.positions(section, found, "positions")
+        places, times = self.positions(section, found, "positions")
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
         measured = {
-            "positions": [list(row) for row in rows],
-            "times": list(times or self.sequence.times or range(len(rows))),
+            "positions": [list(place) for place in places],
+            "times": list(times or self.sequence.times or range(len(places))),
             "sigma": sigma,
             "lever": list(section.lever_arm),
         }
@@ -370,6 +379,20 @@ class MotionReader:
             notes=(*sequence.notes, *inertial.notes),
             warnings=(*sequence.warnings, *inertial.warnings),
         )
+
+
+def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[int | None]:
+    """The row of each pair's left image by its name in a file, with or without folders and ending; None: there is none.
+
+    By the last parts of the path, as many as in the file: COLMAP's names begin at its folder of images.
+    """
+
+    def parts(name: str) -> tuple[str, ...]:
+        return tuple(re.split(r"[/\\]", name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name))
+
+    known = {parts(name): row for row, name in enumerate(names)}
+    paths = [parts(str(pair.left)) for pair in pairs]
+    return [next((known[path[k:]] for k in range(len(path)) if path[k:] in known), None) for path in paths]
 
 
 def _counts(rows: Sequence[Sequence[str]]) -> bool:

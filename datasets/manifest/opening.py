@@ -67,7 +67,7 @@ def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequen
         exact = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
         base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
-    sequence = MotionReader(root, pairs, base, growing=digests.growing).read(manifest)
+    sequence = MotionReader(root, pairs, base, digests.growing, manifest.world.crs or "").read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     return replace(
         sequence,

@@ -32,13 +32,17 @@ DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
 @dataclass(frozen=True)
 class TextTable:
-    """Rows of equal length; ``header`` is empty if the file has no names, ``lines`` are the rows' line numbers."""
+    """Rows of equal length; ``header`` is empty if the file has no names, ``lines`` are the rows' line numbers.
+
+    ``crs``: of columns of latitude and longitude that hold northing and easting, m, instead; empty: there are none.
+    """
 
     name: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
     commas: bool
+    crs: str = ""
 
     @property
     def columns(self) -> int:
@@ -128,8 +132,8 @@ def read_table(path: Path, what: str) -> TextTable:
     """
     lines = read_lines(path, what)
     if form := STRUCTURED.match("\n".join(lines[:SAMPLE])):
-        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres"
-        remedy += " (degrees of latitude and longitude projected, as to UTM)"
+        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
+        remedy += "time,latitude,longitude,altitude in degrees and metres"
         raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=remedy)
     names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []
@@ -170,7 +174,7 @@ def read_table(path: Path, what: str) -> TextTable:
 
 def _named(row: tuple[str, ...], columns: int) -> bool:
     """Whether numbers follow a name, as that of a vehicle or of an image, in as many cells as there are names."""
-    return len(row) == columns and row[0][:1].isalpha() and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
+    return len(row) == columns and row[0][:1].isalnum() and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
 
 
 def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:

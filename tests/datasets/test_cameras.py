@@ -990,6 +990,16 @@ def test_depthai(tmp_path):
         read_cameras(written(tmp_path, json.dumps(text | {"cameraData": rows[:2]}), "oak.json"))
 
 
+@pytest.mark.parametrize("sockets", [(0, 1, 2), ("CAM_A", "CAM_B", "CAM_C")])
+@pytest.mark.parametrize("more", [{}, {"stereoRectificationData": {"leftCameraSocket": -1, "rightCameraSocket": -1}}])
+def test_depthai_without_stereo_data(tmp_path, sockets, more):
+    """As of boards for cameras of one's own: colour at A, left at B, right at C."""
+    a, b, c = sockets
+    text = {"cameraData": [oak(a, -1, (0, 0, 0)), oak(b, c, (-7.5, 0, 0)), oak(c, a, (3.75, 0, 0))], **more}
+    left, right = read_cameras(written(tmp_path, json.dumps(text), "oak.json"))
+    np.testing.assert_allclose(rig_of(left, right)[0].T_right_left.translation, [-0.075, 0, 0], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     "text",
     [

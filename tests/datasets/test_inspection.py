@@ -134,10 +134,27 @@ def test_two_cameras_of_any_names_are_told_apart_and_left_is_a_guess(tmp_path, l
     assert open_manifest(path, Digests()).frames == 3
 
 
-def test_names_that_differ_in_several_ways_tell_no_cameras_apart(tmp_path):
-    write_images(tmp_path, [f"run{k}/cam_{c}.png" for k in (1, 2) for c in "ab"])
+@pytest.mark.parametrize("name", ["{c}/00{k}.png", "run{k}/cam_{c}.png", "cam{c}/frame{k}.png"])
+def test_two_frames_of_two_cameras_differ_by_a_number(tmp_path, name):
+    write_images(tmp_path, [name.format(k=k, c=c) for k in (1, 2) for c in "ab"])
+    views = inspect(tmp_path).views
+    assert (views.pairs, views.trouble) == (2, "")
+    assert "'a' and 'b'" in views.lines[0].replace("cam", "")
+
+
+def test_names_that_differ_by_two_numbers_tell_no_cameras_apart(tmp_path):
+    write_images(tmp_path, [f"run{k}/cam_{c}.png" for k in (1, 2) for c in (3, 4)])
     with raises("RIL-194"):
         inspect(tmp_path)
+
+
+def test_the_folder_of_one_camera_is_in_a_folder_of_both(tmp_path):
+    write_images(tmp_path, both("my rig/{side}/{name}.png", ["1", "2"]))
+    remedy = f"give the folder of both: `rille init '{tmp_path}/my rig'`"
+    with raises("RIL-194", remedy):
+        inspect(tmp_path / "my rig" / "left")
+    with raises("RIL-277", remedy):
+        open_sequence(str(tmp_path / "my rig" / "left"))
 
 
 def test_a_counter_that_began_anew_is_no_reason_to_pair_by_time_stamps(tmp_path):
@@ -152,8 +169,12 @@ def test_names_that_are_time_stamps(tmp_path):
     found = inspect(tmp_path)
     assert found.views.stamped
     assert tomllib.loads(manifest_text(found, "."))["times"] == {"names": True}
-    write_images(tmp_path / "b", both("{side}/{name}.png", ["000048978", "000048979"]))
-    assert not inspect(tmp_path / "b").views.stamped
+    dates = ["img_2026-05-31_12-00-00", "img_2026-05-31_12-00-01"]
+    write_images(tmp_path / "dates", both("{side}/{name}.png", dates))
+    assert inspect(tmp_path / "dates").views.stamped
+    for k, names in enumerate((["000048978", "000048979"], [f"{dates[0]}_a", f"{dates[0]}_b"])):
+        write_images(tmp_path / str(k), both("{side}/{name}.png", names))
+        assert not inspect(tmp_path / str(k)).views.stamped
 
 
 def test_patterns_escape_what_is_special(tmp_path):
@@ -216,10 +237,15 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["#timestamp [ns],w_RS_S_x [rad s^-1],y,z,a,b,c", "140,0,0,0,9.8,0.1,-3.6"], "imu"),
         (["time,roll_deg,pitch_deg,yaw_deg", "0,1,2,3"], "attitude"),
         (["time,x,y", "0,1,2", "1,2,3"], "positions"),
+        (["time,latitude,longitude,altitude", "0,48,9,2"], "positions"),
+        (["time,lat,lon,alt,roll,pitch,yaw", "0,48,9,2,0.1,0.2,3"], "positions"),
+        (["#Label,X/Longitude,Y/Latitude,Z/Altitude", *(f"0{k}.jpg,9,48,2" for k in range(4))], "positions"),
+        (["image,easting,northing", *(f"img_{k}.jpg,9,48" for k in range(4))], "positions"),
         (["east north", "1 2", "3 4"], "positions"),
         (["east north", "1 2", "3 4", "5 6"], ""),
         (["0.0", "0.5"], "times"),
         (["0.0", "0.5", "1.0"], ""),
+        (["00000 1600000000.1 5.0", "00001 1600000000.2 5.0"], ""),
         (["hello", "1 of these"], ""),
         ([], ""),
     ],
@@ -227,6 +253,12 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
 def test_tables_are_told_by_content(tmp_path, lines, kind):
     write_lines(tmp_path / "table.txt", lines)
     assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+@pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
+def test_times_stand_in_a_file_that_is_called_so(tmp_path, row):
+    write_lines(tmp_path / "times.txt", [row.format(k, 1600000000 + k) for k in range(4)])
+    assert table_kind(tmp_path / "times.txt", 2) == "times"
 
 
 def test_poses_with_cells_of_text_are_found(tmp_path):

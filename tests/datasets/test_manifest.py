@@ -537,7 +537,6 @@ def test_true_positions_are_those_of_the_body_that_the_camera_stands_in(tmp_path
 @pytest.mark.parametrize(
     ("more", "lines", "expected"),
     [
-        ("", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat", "project")),
         ("", ["1 2 3", "2 3 4"], ("RIL-805", "3 without names")),
         ('columns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'", "time, x, y")),
         ("", ["x,y", "1,2", "2,3"], ("RIL-803", "2 positions for 3 pairs")),
@@ -918,10 +917,41 @@ def test_positions_without_a_fix_are_left_out_and_counted(tmp_path, names, rows,
 
 
 @pytest.mark.parametrize("more", ["", 'columns = { time = "time", x = "longitude", y = "latitude" }'])
-def test_degrees_are_no_metres(tmp_path, more):
-    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude", "0,48.1,11.5", "1,48.1,11.6"])
-    with raises("RIL-805", "UTM"):
-        opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'))
+def test_positions_in_degrees_are_read_in_metres(tmp_path, more):
+    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude", "0,48.1,9", "1,48.1,9.00001"])
+    s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'))
+    (x, y), (x1, y1) = s.priors["positions"]["positions"]
+    assert (x1 - x, y1 - y) == (pytest.approx(0.744, abs=0.002), pytest.approx(0, abs=1e-3))
+    assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32632" in line]
+    world = '[world]\ncrs = "EPSG:32633"\norigin = [1e3, 2e3, 0]\nazimuth_deg = 0\n'
+    text = f'{TIMED}{world}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'
+    s = opened(write_sequence(tmp_path, text))
+    assert s.priors["positions"]["positions"][0][0] < 100e3  # six degrees west of the middle of its zone
+    assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32633" in line]
+
+
+NAMED = ["left/02.png,3,30", "left/00.png,1,10", "right/01.png,9,9", "left/01.png,2,20"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "xs", "times"),
+    [
+        (NAMED, [1, 2, 3], None),
+        ([line.replace("/", "\\").replace(".png", "") for line in NAMED], [1, 2, 3], None),
+        ([line.replace("left/", "") for line in NAMED if "right" not in line], [1, 2, 3], None),
+        ([*NAMED[:2], "left/01.png,,"], [1, 3], [0, 2]),
+    ],
+)
+def test_positions_by_names_of_images(tmp_path, lines, xs, times):
+    """In any order, of some images or of both cameras', and without a measurement for one."""
+    write_lines(tmp_path / "gnss.csv", ["image,easting,northing", *lines])
+    text = '[positions]\nfile = "gnss.csv"\nsigma = 0.5\n'
+    path = write_sequence(tmp_path, f"{TIMED if times else ''}{text}")
+    found = opened(path).priors["positions"]
+    assert ([row[0] for row in found["positions"]], found["times"]) == (xs, times or [0, 1, 2])
+    write_lines(tmp_path / "gnss.csv", ["image,easting,northing", *(f"other/{k}.png,1,2" for k in range(3))])
+    with raises("RIL-803", "0 positions by names of left images for 3 pairs"):
+        opened(path)
 
 
 def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
@@ -937,7 +967,7 @@ def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
         ("sigma = 0.5", [tum(k, k) for k in range(3)], ("RIL-453", "p.txt", "columns = ")),
         ("sigma = 0.5", ["x,y", "1,2", "2,3"], ("RIL-803", "2 positions for 3 pairs")),
         ("sigma = 0.5", ["time,x,y", "100,1,2", "101,2,3"], ("RIL-269", "100.000")),
-        ("sigma = 0.5", ["lat,lon,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "lat")),
+        ("sigma = 0.5", ["x-ecef,y-ecef,when", "50.1,8.2,0", "50.1,8.3,1"], ("RIL-805", "x-ecef")),
         ('sigma = 0.5\ncolumns = { x = "E" }', ["time,x,y", "0,1,2"], ("RIL-806", "'E'")),
         ("sigma = 0.5", ["time,x,y", "0,1,?", "1,2,3"], ("RIL-284", "line 2")),
         ("", ["time,x,y", "0,1,2", "1,2,3"], ("RIL-223", "positions", "sigma")),

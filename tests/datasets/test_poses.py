@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
+from rille.datasets.inspection import table_kind
 from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -336,8 +337,59 @@ def test_positions_of_rtklib(tmp_path):
     path.write_text(text.format("e-baseline", "n-baseline", "u-baseline"))
     assert positions_of(read_motion(path), "auto", {}).positions == ((1.0, 2.0, 3.0),)
     path.write_text(text.format("x-ecef", "y-ecef", "z-ecef"))
-    with raises("RIL-805", "project"):
+    with raises("RIL-805", "UTM"):
         positions_of(read_motion(path), "auto", {})
+
+
+@pytest.mark.parametrize("steps", ["{1},{0}", "{0},{1}"])
+def test_motions_from_frame_to_frame_are_no_poses(tmp_path, steps):
+    """As RobotCar has them in vo.csv."""
+    rows = [steps.format(100 + k, 101 + k) + ",1,0,0,0,0,0.1" for k in range(3)]
+    (tmp_path / "vo.csv").write_text("\n".join(["source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw", *rows]))
+    for read in (read_motion, lambda path: table_kind(path, 3)):
+        with raises("RIL-775", "vo.csv", "destination_timestamp"):
+            read(tmp_path / "vo.csv")
+
+
+@pytest.mark.parametrize("south", [1, -1])
+@pytest.mark.parametrize(
+    ("names", "row"),
+    [
+        ("time,latitude,longitude,altitude", "{k},{lat},{lon},7"),
+        ("#Label,X/Longitude,Y/Latitude,Z/Altitude", "img{k}.jpg,{lon},{lat},7"),
+        ("time [s];GPS_Lat [deg];gps lng;height", "{k};{lat};{lon};7"),
+        ("__time,/fix/latitude,/fix/longitude,/fix/altitude", "{k},{lat},{lon},7"),
+        ("time,lat,lon,/imu/depth,roll,pitch,yaw", "{k},{lat},{lon},-7,1,2,3"),
+    ],
+)
+def test_degrees_become_metres_of_the_zone_of_the_first_place(tmp_path, names, row, south):
+    """On the meridian in a zone's middle; places beyond the zone's edge stay in it, and 0, 0 is no place."""
+    places = [(48.1, 9.0), (48.101, 9.0), (48.1, 12.1), (0, 0)]
+    lines = [row.format(k=k, lat=south * lat, lon=lon) for k, (lat, lon) in enumerate(places)]
+    (tmp_path / "p.csv").write_text("\n".join([names, *lines]))
+    found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
+    (x, y, z), (x1, y1, _), (x2, _, _) = found.positions
+    assert (x, x1, z) == (pytest.approx(500000), pytest.approx(500000), 7)
+    # 6 335 439 m / (1 - e2 sin2)^1.5 is the radius of the meridian; 0.9996 the scale of UTM.
+    radius = 6335439.3 / (1 - 0.00669438 * np.sin(np.deg2rad(48.1)) ** 2) ** 1.5
+    assert y1 - y == pytest.approx(south * 0.9996 * radius * np.deg2rad(0.001), rel=1e-5)
+    assert x2 - x == pytest.approx(111320 * np.cos(np.deg2rad(48.1)) * 3.1, rel=0.01)
+    assert [line for line in found.warnings if f"EPSG:32{'6' if south > 0 else '7'}32" in line]
+    assert sum("RIL-706" in line for line in found.warnings) == 1
+
+
+def test_places_all_around_the_earth_make_no_plane(tmp_path):
+    (tmp_path / "p.csv").write_text("time,latitude,longitude\n0,48,9\n1,0,99\n")
+    with raises("RIL-776", "EPSG:32632"):
+        read_motion(tmp_path / "p.csv")
+
+
+@pytest.mark.parametrize("row", ["0,4806.1,930.2", "0,lost,9"])
+def test_what_is_no_degree_is_no_place(tmp_path, row):
+    """Degrees and minutes, as in sentences of NMEA."""
+    (tmp_path / "p.csv").write_text(f"time,latitude,longitude\n{row}\n")
+    with raises("RIL-805", "degrees"):
+        positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
 
 
 def test_positions_in_degrees_are_refused_by_their_unit(tmp_path):

@@ -18,6 +18,7 @@ from rille.pipeline.export.programs.placed_pairs import PlacedPair, PlacedPairs
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import frames_of, georeference_in
 from rille.pipeline.export.writers import ENGINEERING_CRS
+from rille.stages.core.arrays import Floats
 from rille.stages.core.quantities import count
 from rille.stages.terrain.points import colours, cubes, one_a_cube
 
@@ -29,7 +30,7 @@ ABOUT = {
 }
 """Descriptions of the columns that LAS does not define, at most 32 characters each."""
 
-PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "uint"}
+PLY_TYPES = {"float64": "double", "float32": "float", "uint8": "uchar", "uint32": "int"}  # Open3D reads no uint
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -57,15 +58,16 @@ def write_run(path: Path, run: RunArtifacts, every: int = 1, voxel: float = 0.0)
     crs = CRS.from_user_input(place.crs if place is not None else ENGINEERING_CRS).to_wkt(version="WKT1_GDAL")
     write = _write_laz if path.suffix.lower() == ".laz" else _write_ply
     parts = (_columns(run, one, place) for one in pairs)
-    points = write(path, _thinned(parts, voxel) if voxel else parts, crs)
+    origin = np.zeros(3) if place is None else np.array(place.origin)
+    points = write(path, _thinned(parts, voxel, origin) if voxel else parts, crs)
     return f"{count(points, 'point')} of {pairs.words}"
 
 
-def _thinned(parts: Iterator[Columns], voxel: float) -> Iterator[Columns]:
-    """Points of each pair after thinning."""
+def _thinned(parts: Iterator[Columns], voxel: float, origin: Floats) -> Iterator[Columns]:
+    """Points of each pair after thinning; cubes count from ``origin`` (3,), m: from 0 on Earth there are too many."""
     taken = np.zeros(0, np.int64)
     for columns in parts:
-        cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]), voxel)
+        cube = cubes(np.column_stack([columns[axis] for axis in "xyz"]) - origin, voxel)
         first = one_a_cube(cube, columns["sigma_along"])
         first = first[~np.isin(cube[first], taken)]
         taken = np.union1d(taken, cube[first])

@@ -122,16 +122,19 @@ def test_trimesh_reads_the_same_points(tmp_path: Path, place: Georeference | Non
     np.testing.assert_allclose(cloud.vertices, position if place is None else place.apply(position), atol=2e-6)
     np.testing.assert_array_equal(cloud.colors[:, 0], 10 * pair)
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    assert "property int pair" in header  # Open3D leaves out what is uint
     crs = pyproj.CRS.from_wkt(header.split("comment crs ")[1].splitlines()[0])
     assert crs.is_engineering if place is None else crs.to_epsg() == 32633
 
 
-def test_of_a_voxel_one_point_stays_the_first_pair_s(tmp_path: Path) -> None:
-    run = Recorded(tmp_path / "run")
+@pytest.mark.parametrize("place", [None, PLACE])
+def test_of_a_voxel_one_point_stays_the_first_pair_s(tmp_path: Path, place: Georeference | None) -> None:
+    run = Recorded(tmp_path / "run", place)
     written(run, tmp_path / "all.ply")
     written(run, tmp_path / "thin.ply", voxel=0.5)
     whole, thin = (trimesh.load(tmp_path / f"{n}.ply") for n in ("all", "thin"))
-    cubes = [np.floor(cloud.vertices / 0.5) for cloud in (whole, thin)]
+    origin = 0.0 if place is None else np.array(place.origin)
+    cubes = [np.floor((cloud.vertices - origin) / 0.5) for cloud in (whole, thin)]
     assert len(np.unique(cubes[1], axis=0)) == len(cubes[1]) == len(np.unique(cubes[0], axis=0))
     # The grey value is ten times the pair.
     of_first = {tuple(cube) for cube in cubes[0][whole.colors[:, 0] == 30]}
