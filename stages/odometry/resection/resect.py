@@ -247,7 +247,8 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     departs = (off[1][use] - off[0][use]) / unit
     jump = np.median(departs, axis=0)
     torn = float((np.linalg.norm(departs - jump, axis=1) > 2 * MIN_JUMP_PX).mean())
-    if torn > MAX_TORN_SHARE:
+    # 0.25: of the landmarks; fewer are left of a wide turn, at the rim of the view, where disparities are worst.
+    if torn > MAX_TORN_SHARE and use.sum() >= 0.25 * len(use):
         return {"torn": torn}
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
         return {}
