@@ -173,11 +173,16 @@ class Chain:
 
     def _calibration(self, basic: list[int]) -> Bundle:
         rig = self.sequence.rig.to_dict()
-        orientations = [self._stage("orientation", {"pair": k, "rig": rig}, disparity=self.disparity[k]) for k in basic]
+        orientations = [self._orientation(k) for k in basic]
         given = {"rig": rig} | ({"first": self.given.sequence.rig.to_dict()} if self.corrections else {})
         found = self._stage("rig", given, orientations=orientations)
         self.rig_facts = found.meta
         return self._stage("calibration", {}, rig=found)
+
+    def _orientation(self, pair: int) -> Bundle:
+        both = {c: self._image(pair, c) for c in ("left", "right")}
+        args = {"pair": pair, "rig": self.sequence.rig.to_dict()}
+        return self._stage("orientation", args, disparity=self.disparity[pair], **both)
 
     def _segment(self, part: list[int]) -> tuple[Bundle, Bundle]:
         key, s = part[0], self.sequence
