@@ -64,10 +64,9 @@ class ResectFacts(Facts):
     """Poses of a segment's frames.
 
     ``per_frame``: frame, landmarks, inliers, rms_px of each, why it is ``lost``, and ``bias_px``, an error of all
-    disparities with which it has a pose. ``intrinsics``: what the segment,
-    adjusted jointly, says of errors of the calibration (``information``, ``pull``, ``turn_deg``; ``yaw`` and
-    ``read_out``: information and pull of the rig's, and of the time that passes between the first and the last row),
-    and the ``bias_px`` of its disparities; empty where nothing was adjusted.
+    disparities with which it has a pose. ``intrinsics``: what the segment, adjusted jointly, says of errors of the
+    calibration (:class:`rille.stages.odometry.resection.calibration_errors.IntrinsicsPart`, ``turn_deg``), and the
+    ``bias_px`` of its disparities; empty where nothing was adjusted.
     ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end. ``torn``: share of
     that pair's disparities that depart otherwise than the others.
     """

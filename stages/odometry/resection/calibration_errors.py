@@ -75,14 +75,14 @@ class IntrinsicsPart(NamedTuple):
 
     ``by_error`` (frame, 6, k): changes of its poses (position m, rotation vector rad of T_local_left) with each.
     ``yaw``: information and pull of the rig's yaw, rad, by the common error of its disparities, without the prior of
-    that, which would draw it towards zero. ``read_out``: those of the time from the first to the last row, in intervals
-    between frames.
+    that, which would draw it towards zero; and how the pull changes with the toe-in. ``read_out``: information and pull
+    of the time from the first to the last row, in intervals between frames.
     """
 
     information: Floats
     pull: Floats
     by_error: Floats
-    yaw: tuple[float, float]
+    yaw: tuple[float, float, float]
     read_out: tuple[float, float]
 
 
@@ -199,7 +199,8 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
     moved, ray = turned.landmarks.position - tracks.landmarks.position, tracks.landmarks.per_pixel
     along = (moved * ray).sum(1) / (ray**2).sum(1)
     px_per_rad, of_bias = float(np.nanmedian(along)) / STEP, 1.0 / float(inverse[-1, -1])
-    yaw = max(of_bias - prior, 0.0) * px_per_rad**2, of_bias * state.bias * px_per_rad
+    by_toe_in = of_bias * step[p - 1, -1] * px_per_rad
+    yaw = max(of_bias - prior, 0.0) * px_per_rad**2, of_bias * state.bias * px_per_rad, by_toe_in
     return IntrinsicsPart(information, right[p:] + step.T @ right[:p], by_error.reshape(-1, 6, k), yaw, read_out)
 
 

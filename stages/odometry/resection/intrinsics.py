@@ -262,11 +262,12 @@ def intrinsics_stage(
     least = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
     common = common_errors(information, pull, params.sigma, least)
     left = np.append(common.errors[:-1], 0.0)  # poses are corrected for the toe-in
-    shown = {name: np.array([part[name] for part in parts]).reshape(-1, 2) for name in ("yaw", "read_out")}
+    # The common error of disparities is that of a rig whose toe-in is right.
+    yaws = np.array([part["yaw"] for part in parts]).reshape(-1, 3) @ [[1, 0], [0, 1], [0, common.errors[-1]]]
     least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
-    yaw, turn = alone(shown["yaw"], least / focal)
-    bend, bent = alone(shown["yaw"], MIN_YAW_PX / focal, change=True)
-    read_out, late = alone(shown["read_out"], MIN_READ_OUT)
+    yaw, turn = alone(yaws, least / focal)
+    bend, bent = alone(yaws, MIN_YAW_PX / focal, change=True)
+    read_out, late = alone(np.array([part["read_out"] for part in parts]).reshape(-1, 2), MIN_READ_OUT)
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
     late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
