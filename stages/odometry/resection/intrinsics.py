@@ -2,9 +2,9 @@
 
 The parts of all segments (:mod:`rille.stages.odometry.resection.calibration_errors`) and the priors of a usual
 calibration give the errors and their covariance; the trajectory adds it up like other errors that all segments share.
-All segments count for the rig's yaw, each by its own common error, and for its toe-in, for which the trajectory's poses
-are corrected to first order: a rig of the usual calibration may have one of several pixels at the sides of the images,
-and a drive over near ground sees another length of its way than one without.
+All segments count for the rig's toe-in, for which the trajectory's poses are corrected to first order: with a usual
+calibration it may move disparities at the sides of the images by pixels, so that near and far landmarks give different
+lengths of one way. With that toe-in all segments count for the rig's yaw, too, each by its own common error.
 
 A number that the tracks contradict is corrected, and images, rig, segments and maps are computed anew with the
 corrected calibration. An error that does not contradict its prior is part of the covariance alone. Rows that are read
@@ -67,9 +67,9 @@ class IntrinsicsParams(Params):
 
     Attributes
     ----------
-    prior : standard deviation, as calibrated, of the focal length and of the principal point over the focal length, and
-        of the radial distortion (k1); a tenth of it is that of the rig's angles [rad]; 0.005 is usual for a calibration
-        with a target.
+    prior : standard deviation, as calibrated, of the focal length and of the principal point over the focal length, of
+        the radial distortion (k1), and of the toe-in [rad]; a tenth of it is that of the rig's other angles [rad];
+        0.005 is usual for a calibration with a target.
     """
 
     prior: float = Field(0.005, gt=0)
@@ -262,8 +262,9 @@ def intrinsics_stage(
     least = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
     common = common_errors(information, pull, params.sigma, least)
     left = np.append(common.errors[:-1], 0.0)  # poses are corrected for the toe-in
+    yaw_parts = np.array([part["yaw"] for part in parts]).reshape(-1, 3)
     # The common error of disparities is that of a rig whose toe-in is right.
-    yaws = np.array([part["yaw"] for part in parts]).reshape(-1, 3) @ [[1, 0], [0, 1], [0, common.errors[-1]]]
+    yaws = np.column_stack([yaw_parts[:, 0], yaw_parts[:, 1] + common.errors[-1] * yaw_parts[:, 2]])
     least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
     yaw, turn = alone(yaws, least / focal)
     bend, bent = alone(yaws, MIN_YAW_PX / focal, change=True)
