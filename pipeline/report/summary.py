@@ -275,10 +275,10 @@ def resting(view: RunView) -> list[str]:
     held = [f"{name} +- {100.0 * sigma:.2g} %" for name, (_, sigma) in numbers if name in facts["held"]]
     text = "These numbers of the cameras rest on the calibration as given, for the tracks show little of them"
     lines = [f"{text}: {', '.join(held)} of the focal length; the covariances of poses hold that."] if held else []
-    return lines + toed_in(view)
+    return lines + wrong_toe_in(view)
 
 
-def toed_in(view: RunView) -> list[str]:
+def wrong_toe_in(view: RunView) -> list[str]:
     """A line on a toe-in that poses are corrected for and elevations are not, if it is known and more than little."""
     facts, rig = facts_of(view, view.products.intrinsics), view.sequence.rig
     angle, sigma = facts.get("errors", {}).get("toe-in", (0.0, 1.0))

@@ -259,8 +259,7 @@ def intrinsics_stage(
     focal, upright = given.left.fx, epipolar.standing(given)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
-    least = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
-    common = common_errors(information, pull, params.sigma, least)
+    common = common_errors(information, pull, params.sigma, least=MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR)
     left = np.append(common.errors[:-1], 0.0)  # poses are corrected for the toe-in
     yaw_parts = np.array([part["yaw"] for part in parts]).reshape(-1, 3)
     # The common error of disparities is that of a rig whose toe-in is right.

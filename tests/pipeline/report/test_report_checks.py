@@ -87,7 +87,7 @@ def test_a_toe_in_is_told_where_it_moves_disparities_at_the_sides(angle, told, m
     rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
     monkeypatch.setattr(summary, "facts_of", lambda *_: {"errors": {"toe-in": [angle, 0.0001]}})
     products = SimpleNamespace(intrinsics=None)
-    lines = summary.toed_in(SimpleNamespace(products=products, sequence=SimpleNamespace(rig=rig)))
+    lines = summary.wrong_toe_in(SimpleNamespace(products=products, sequence=SimpleNamespace(rig=rig)))
     assert bool(lines) == told
     assert all("by 1.3 px" in line and "+0.143 +- 0.006 degrees" in line for line in lines)
 
