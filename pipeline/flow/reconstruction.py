@@ -31,8 +31,8 @@ A *basic pair* is a stereo pair that is matched and gets an elevation model; a *
 one basic pair to the next. A *lost* frame has no usable image (black, of another scene, left and right exchanged):
 ``frame_screening`` finds it by ``image_quality``, by motions, by bridges (motions over it), and by ``swap_check``.
 ``synchrony`` compares pairs whose rows the rig does not explain with right images of other times; pairs of two times
-are not basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: after a knock of
-the rig no frame gets a pose.
+are not basic, and ``keyframes`` chooses anew. ``resect`` compares each basic pair with the one before: from a knock of
+the rig on, ``knocked`` gives the rig that it left.
 
 The landmarks of a segment are relative to its own basic pair, so all segments are resected in parallel, and
 ``trajectory`` chains them. ``intrinsics`` estimates errors of the calibration from all segments; if it corrects the
@@ -64,6 +64,8 @@ from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.builders import BasicPair, Builder, Pair, Segment, centre, merge_tiles, other_plane
+from rille.stages.calibration.calibration import calibration_stage
+from rille.stages.calibration.knocked import knocked_stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.evaluation.crosscheck import crosscheck_stage, windows
 from rille.stages.evaluation.crosscheck_join import crosscheck_join_stage
@@ -105,6 +107,9 @@ TILE_CELLS = 512
 MAX_CALIBRATIONS = 6
 """Corrections of the calibration: one to three are usual for a focal length that is 10 % off, two for a yaw that is
 half a degree off."""
+
+MAX_KNOCKS = 4
+"""Knocks of a rig that are followed; behind further ones no frame has a pose."""
 
 MISFIT = (
     "its left and right do not fit each other as those of its neighbours do: one of them is damaged, or of another time"
@@ -195,10 +200,11 @@ def tracked(
 ) -> Generator[Wait, Any, Tracked | None]:
     """Match the basic pairs and track between them; None where nothing can be measured.
 
-    Repeat without the images, or with corrected cameras, that the tracks contradict.
+    Repeat without the images, or with corrected cameras, that the tracks contradict; from a knock of the rig on with
+    the rig that it left.
     """
     p, attempt, since = make.products, 0, len(make.graph.nodes)
-    refused, torn = dict[int, str](), None
+    refused, torn, knocks = dict[int, str](), None, dict[int, ResectFacts]()
     while True:
         if attempt and p.crosscheck is not None:
             p.crosscheck = crosscheck_tasks(make, whole)
@@ -206,7 +212,7 @@ def tracked(
         if choice is None:
             return None
         yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, choice.rigs)
+        matched = yield from matched_pairs(make, after_knocks(make, choice.rigs, knocks))
         # Of most pairs a wrong rig is the cause, of few their images.
         impossible = [k for k, level in p.ground.items() if level.error is not None]
         if 0 < 2 * len(impossible) < len(matched):
@@ -217,7 +223,7 @@ def tracked(
         # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
         runs = [[choice.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
         segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
-        segments, moved = yield from refuse_knocked(make, matched, segments)
+        segments, moved, knock = yield from refuse_knocked(make, matched, segments)
         p.resections = [s.resection for s in segments]
         wanted = suspects(segments, choice.chain) if torn is None else confirmed(segments, choice.chain, torn)
         if wanted != (torn or {}):
@@ -225,7 +231,14 @@ def tracked(
             make.discard(since)
             continue
         key = matched[choice.basic[0]]
-        correction = (yield from corrected_calibration(make, key)) if segments and make.config.resect.joint else None
+        # A knock leaves another rig than the one given.
+        sound = [s.resection for s in segments if s.frames[0] not in moved]
+        judged = sound and make.config.resect.joint
+        correction = (yield from corrected_calibration(make, key, sound)) if judged else None
+        if correction is None and knock.keys() - knocks.keys() and len(knocks) < MAX_KNOCKS:
+            knocks |= knock
+            make.discard(since)
+            continue
         if correction is None or attempt == MAX_CALIBRATIONS:
             if p.intrinsics is not None:
                 p.contradictions.append(p.intrinsics)
@@ -528,26 +541,45 @@ def vertical(make: Builder, pair: int) -> dict[str, Any]:
     return {"up": up and list(up), "pitch": make.sequence.pitch}
 
 
+def after_knocks(
+    make: Builder, rigs: Mapping[int, Handle[CalibrationFacts]], knocks: Mapping[int, ResectFacts]
+) -> dict[int, Handle[CalibrationFacts]]:
+    """The rigs of stereo pairs; from the pair of each of the ``knocks`` on, the rig that it left."""
+    p, out = make.products, dict(rigs)
+    for at, said in knocks.items():
+        turned = dict[int, tuple[Handle[RigFacts], Handle[CalibrationFacts]]]()
+        for k in (k for k in out if k >= at):
+            rig = p.rigs[k]
+            if rig.index not in turned:
+                what = {"jump": said["jump"], "cause": said["knocked"]}
+                known = make.node(knocked_stage, f"knocked/{at}/{k}", rig=rig, **what)
+                turned[rig.index] = known, make.node(calibration_stage, f"calibration/knocked/{at}/{k}", rig=known)
+            p.rigs[k], out[k] = turned[rig.index]
+    return out
+
+
 def refuse_knocked(
     make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]
-) -> Generator[Wait, Any, tuple[list[Segment], set[int]]]:
-    """Refuse segments after a knock of the rig; return all segments, and the basic pairs after the knock.
+) -> Generator[Wait, Any, tuple[list[Segment], set[int], dict[int, ResectFacts]]]:
+    """Refuse segments after a knock of the rig; return all segments, the basic pairs after the knock, and by its pair
+    the facts of the first one, unless the rig is fixed.
 
     The rig was knocked if a basic pair measures other disparities than the first pair, which stands for the
     calibration made before the drive.
     """
     p, by, cause = make.products, np.zeros(2), ""
-    out, moved = [], set[int]()
+    out, moved, first = [], set[int](), dict[int, ResectFacts]()
     judged = yield Maybe([s.resection for s in segments])
     for s, one in zip(segments, judged, strict=True):
         k, end = s.frames[0], s.frames[-1]
         out.append(make.segment(s.frames, pairs[k], f"{k}/refused", refused=cause) if k in moved else s)
         if one is not None and "jump" in one.meta:
             by, cause = by + one.meta["jump"], one.meta["knocked"]
+            first = first or {end: one.meta}
             p.contradictions.append(s.resection)
         if end in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
             moved.add(end)
-    return out, moved
+    return out, moved, first if make.config.rig.mode != "fixed" else {}
 
 
 def step_measures(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:
@@ -615,12 +647,14 @@ def moving_parts(
     return out
 
 
-def corrected_calibration(make: Builder, key: BasicPair) -> Generator[Wait, Any, IntrinsicsFacts | None]:
+def corrected_calibration(
+    make: Builder, key: BasicPair, segments: list[Handle[ResectFacts]]
+) -> Generator[Wait, Any, IntrinsicsFacts | None]:
     """Correction of the calibration that all segments agree on, None if they need none; ``key`` gives the rig."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
     asked = {"before": make.correction, "fixed": fixed or None}
-    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=p.resections, rig=key.rig, **asked)
+    p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=segments, rig=key.rig, **asked)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
     facts: Any = None if judged[0] is None else judged[0].meta
     # A plan takes the facts of earlier runs, which may be those of an earlier release.

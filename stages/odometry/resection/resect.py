@@ -25,10 +25,13 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import ResectFacts, TrackFacts
 from rille.stages.facts.terrain import GroundFacts
+from rille.stages.geometry import epipolar
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.pose_arrays import BY_INTRINSICS, COVARIANCE, POSES, SHARED
 from rille.stages.geometry.scale import right_pixels
+from rille.stages.numeric.least_squares import irls
+from rille.stages.numeric.robust import cauchy
 from rille.stages.odometry.resection.bundle_adjustment import PosedTracks, SegmentAdjustment, adjust, pose_errors
 from rille.stages.odometry.resection.calibration_errors import PRIORS, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
@@ -220,6 +223,17 @@ class ResectInputs(NamedTuple):
     rig_after: Bundle[CalibrationFacts] | None = None
 
 
+def jump_of(departs: Floats, grows: Floats) -> Floats:
+    """Jump (2,) of the disparities from one basic pair to the next, px, by their departures (point, 2).
+
+    A rig that was wrong from the start puts landmarks at wrong distances: their disparities then depart by as much as
+    they grow, (point,), as a share. A jump is the departure of landmarks that keep their disparity, and of most others.
+    """
+    line = np.stack([np.ones(len(grows)), grows], axis=1)
+    kept = irls(line, departs, lambda off: cauchy(off, MIN_JUMP_PX), 1e-6 * np.eye(2))[0]
+    return min(np.median(departs, axis=0), kept, key=np.linalg.norm)
+
+
 def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> dict[str, Any]:
     """Facts of the basic pair at the segment's end where it contradicts the segment's own: the rig has moved, or a part
     of one image is displaced.
@@ -236,17 +250,24 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
         return {}
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
-    use, off = segment.inlier[:, -1] != 0, []
+    use, off, shown = segment.inlier[:, -1] != 0, [], []
+    side = 1 if epipolar.standing(then) else 0
     for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
         disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
         at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)
+        right = rig.right.project(rig.T_right_left.apply(at))
+        shown.append(right - rig.left.project(at))
         use &= matched
-        off.append(disparity - (rig.right.project(rig.T_right_left.apply(at)) - rig.left.project(at)))
+        error = disparity - shown[-1]
+        # A turn of the camera moves what is aside farther than what is in the middle.
+        error[:, side] /= 1.0 + rig.right.rays(right)[:, side] ** 2
+        off.append(error)
     if use.sum() < MIN_LANDMARKS:
         return {}
     departs = (off[1][use] - off[0][use]) / unit
-    jump = np.median(departs, axis=0)
-    torn = float((np.linalg.norm(departs - jump, axis=1) > 2 * MIN_JUMP_PX).mean())
+    grows = np.linalg.norm(shown[1][use], axis=1) / np.linalg.norm(shown[0][use], axis=1) - 1.0
+    jump = jump_of(departs, grows)
+    torn = float((np.linalg.norm(departs - np.median(departs, axis=0), axis=1) > 2 * MIN_JUMP_PX).mean())
     # 0.25: of the landmarks; fewer are left of a wide turn, at the rim of the view, where disparities are worst.
     if torn > MAX_TORN_SHARE and use.sum() >= 0.25 * len(use):
         return {"torn": torn}
@@ -256,7 +277,8 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
         f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
         f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"
     )
-    return {"knocked": line, "jump": jump.tolist(), "warnings": [f"{line}: calibrate anew from there on"]}
+    remedy = f"calibrate anew from there on, or compute what follows by itself (--frames {segment.facts[-1]['frame']}:)"
+    return {"knocked": line, "jump": jump.tolist(), "warnings": [f"{line}: {remedy}"]}
 
 
 @stage(

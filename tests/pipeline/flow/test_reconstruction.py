@@ -353,8 +353,24 @@ def test_what_a_knocked_rig_measures_is_worth_no_pose(back: bool, refused: list[
     jumps = {"resect/3": {"jump": [3.0, 0.0], "knocked": "the rig moved at pair 5"}}
     if back:
         jumps["resect/5"] = {"jump": [-2.6, 0.1], "knocked": "the rig moved at pair 6"}
-    _, products = lay_out([], WHOLE, CHOICE, POSED, jumps=jumps)
+    _, products = lay_out([], WHOLE, CHOICE, POSED, jumps=jumps, rig={"mode": "fixed"})
     said = [h.spec.args.get("refused") for h in products.resections]
     assert [int(h.label.split("/")[1]) for h, cause in zip(products.resections, said, strict=True) if cause] == refused
     assert set(said) == {None, "the rig moved at pair 5"}
     assert list(products.world_dem) == list(products.local_dem) == world
+    # The given calibration is judged by what was measured with it.
+    assert products.intrinsics is not None
+    assert products.intrinsics.inputs["segments"] == [
+        h for h, cause in zip(products.resections, said, strict=True) if cause is None
+    ]
+
+
+def test_from_a_knock_on_the_rig_that_it_left_is_used() -> None:
+    knock = {"jump": [3.0, 0.0], "knocked": "the rig moved at pair 5"}
+    _, products = lay_out([], WHOLE, CHOICE, POSED, jumps={"resect/3": knock}, cameras=[[0.0] * 4])
+    assert [h.label for h in products.rigs.values()] == ["rig", "rig", "knocked/5/5", "knocked/5/5"]
+    assert products.rigs[5].spec.args == {"jump": [3.0, 0.0], "cause": "the rig moved at pair 5"}
+    known = [h.inputs["rig"] for h in products.local_dem.values()]
+    assert [one.inputs["rig"] for one in known if isinstance(one, Handle)] == list(products.rigs.values())
+    assert [h.spec.args.get("refused") for h in products.resections] == [None] * 4
+    assert not products.contradictions or products.contradictions == [products.intrinsics]

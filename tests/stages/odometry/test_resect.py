@@ -22,7 +22,14 @@ from rille.stages.geometry.projection import perturbed
 from rille.stages.numeric.least_squares import levenberg_marquardt
 from rille.stages.odometry.resection.landmarks import Landmarks
 from rille.stages.odometry.resection.pnp import Observations, Pose, PoseAdjustment, back_projection
-from rille.stages.odometry.resection.resect import ResectInputs, SegmentPoints, of_pair_behind, resect_segment
+from rille.stages.odometry.resection.resect import (
+    MIN_JUMP_PX,
+    ResectInputs,
+    SegmentPoints,
+    jump_of,
+    of_pair_behind,
+    resect_segment,
+)
 from rille.stages.odometry.resection.robust_pose import ResectParams, resect
 
 CAMERA = Camera(600.0, 610.0, 300.0, 250.0, 600, 500)
@@ -527,8 +534,10 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, fine
     def wall(T: RigidTransform, column: float, row: float) -> Bundle:
         rays = CAMERA.rays(np.stack([u.ravel(), v.ravel()], 1).astype(float)) @ T.rotation.T
         depth = ((8.0 - T.translation[2]) / rays[:, 2]).reshape(u.shape)
+        still = u - 0.3 * CAMERA.fx / depth
+        aside = 1.0 + ((still - CAMERA.cx) / CAMERA.fx) ** 2  # a turn moves these pixels farther
         disparity = {
-            "column_disparity": finer * (u + column - 0.3 * CAMERA.fx / depth) - u,
+            "column_disparity": finer * (still + column * aside) - u,
             "row_disparity": finer * (v + row) - v,
             "validity": np.full(u.shape, Validity.MATCHED, np.uint8),
         }
@@ -553,6 +562,17 @@ def test_a_rig_that_is_knocked_between_two_pairs_is_told(column, row, told, fine
         assert f"{(column or row):+.1f} px in the" in facts["knocked"]
     found.poses[-1] = np.nan  # the pair at the end has no pose: nothing is told
     assert of_pair_behind(given.tracks, found, inputs) == {}
+
+
+def test_disparities_that_depart_as_they_grow_are_those_of_a_rig_that_was_wrong_from_the_start():
+    rng = np.random.default_rng(5)
+    grows = rng.uniform(0.0, 0.3, 100)
+    departs = np.stack([-7.4 * grows, np.zeros(100)], 1) + rng.normal(0.0, 0.2, (100, 2))
+    departs[:10] += 15.0  # mistracked
+    assert np.linalg.norm(np.median(departs, axis=0)) > MIN_JUMP_PX
+    assert np.linalg.norm(jump_of(departs, grows)) < 0.3
+    np.testing.assert_allclose(jump_of(departs + np.array([3.0, 0.0]), grows), [2.0, 0.0], atol=0.3)  # the median
+    np.testing.assert_allclose(jump_of(departs - np.array([3.0, 0.0]), grows), [-3.0, 0.0], atol=0.3)  # as they began
 
 
 def with_a_lorry(beside, before, farthest=60):
