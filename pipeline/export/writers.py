@@ -80,15 +80,16 @@ class Meaning:
 
 
 def check_folder(folder: Path, ours: str = "") -> None:
-    """Refuse to write a folder that is not empty, unless it holds a file named ``ours`` and so is one of ours.
+    """Refuse to write a folder where there is a file, or a folder with files, unless one of them is named ``ours``.
 
     Raises
     ------
     ConfigError
         It is refused.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not (ours and (folder / ours).exists()):
-        raise ConfigError("RIL-607", f"{folder} is not empty", remedy="give a new folder with --output")
+    taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if taken and not (ours and (folder / ours).exists()):
+        raise ConfigError("RIL-607", f"{folder} exists, and is no empty folder", remedy="name a new one")
 
 
 def write_raster(

@@ -70,7 +70,7 @@ def of_pairs(p: Products) -> tuple[object, ...]:
     """Products that :func:`pairs` reads."""
     return (
         *(p.keyframes, p.screening, p.orientations, p.disparity, p.level, p.local_dem, p.local_risk, p.local_path),
-        *(p.local_dem_accuracy, p.seams),
+        *(p.disparity_accuracy, p.local_dem_accuracy, p.seams),
     )
 
 
@@ -89,6 +89,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
         dem, path = facts_of(view, p.local_dem.get(pair)), facts_of(view, p.local_path.get(pair))
         shares = facts_of(view, p.local_risk.get(pair)).get("shares", {})
         judged = facts_of(view, p.local_dem_accuracy.get(pair)).get("metrics", {})
+        matching = facts_of(view, p.disparity_accuracy.get(pair)).get("metrics", {})
         rows.append(
             {
                 "frame": pair,
@@ -107,6 +108,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
                 "rmse_m": judged.get("rmse", {}).get("value"),
                 "completeness": judged.get("completeness", {}).get("value"),
                 "tilt_deg": judged.get("tilt", {}).get("value"),
+                "against_truth": {"disparity": matching, "elevation": judged},
                 "why_basic": why.get(pair),
                 "overlap": overlap.get(pair),
                 "epipolar_px": facts_of(view, p.orientations.get(pair)).get("residual_before_px"),

@@ -193,13 +193,13 @@ def test_a_run_writes_the_files_that_it_describes(tmp_path: Path) -> None:
     facts = catalogue.describe(names, whole)
     described = [o.name for o in catalogue.OUTPUTS if o.frame]
     assert list(facts["files"]) == described
-    assert set(described) | {"risk.tif.aux.xml", "accuracy.json"} == set(names)
+    assert set(described) | {"risk.tif.aux.xml"} == set(names)
     assert {about["frame"] for about in facts["files"].values()} <= catalogue.FRAMES.keys()
     assert facts["frames"][4] == {"frame": 4, "name": "left004", "time": 4.0}
     assert facts["units"]["time"] == "frame number"
     assert facts["frames_of_reference"]["world"]["handedness"] == "right"
     assert "scalar last" in facts["conventions"]["quaternion"]
-    assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "accuracy.json"]
+    assert [name for name, *_ in catalogue.listed(tmp_path)][:3] == ["report.html", "report.json", "agreement.csv"]
     assert all(words and programs for _, words, programs in catalogue.listed(tmp_path))
     rows = list(csv.DictReader((tmp_path / "agreement.csv").open()))
     assert "time_s" not in rows[0], "numbers of frames are no seconds"
