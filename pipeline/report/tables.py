@@ -41,6 +41,9 @@ def frames(scene: gather.Scene) -> list[Row]:
                 "error_m": None if track.error is None else finite(track.error[i]),
                 "disagreement_m": None if compared is None else finite(compared.distance[i]),
                 "disagreement_deg": None if compared is None else finite(np.degrees(compared.angle[i])),
+                "step_disagreement_m": None if compared is None else finite(compared.step_distance[i]),
+                "step_disagreement_deg": None if compared is None else finite(np.degrees(compared.step_angle[i])),
+                "crosscheck_error_m": None if compared is None else finite(compared.error_crosscheck[i]),
                 "flagged": compared is not None and bool(compared.flagged[i]),
                 "basic": frame in view.products.disparity,
             }
