@@ -27,10 +27,6 @@ class Measured:
     """Seconds a node that is found in the cache."""
     scheduler: float = 1.5e-3
     """Seconds of processor a task, of dask's scheduler and the client (97 860 nodes of benchmarks/scale.py)."""
-    index: float = 1.36e3
-    """Bytes a node of the index, unpacked."""
-    index_limit: float = 256e6
-    """Bytes that a client unpacks (``index.MOST``)."""
     stored: float = 95e3
     """Bytes an artifact."""
     scan: float = 1.5e-3
@@ -38,7 +34,6 @@ class Measured:
 
 
 LIMITS = (
-    ("index", "the index is too large to be read: a warm run reads every manifest"),
     ("client", "the client holds more than 4 GB"),
     ("scan", "one task takes more than a minute: keyframes and trajectory go through all frames"),
     ("scheduler", "the scheduler has less time for a task than it needs: more workers gain nothing"),
@@ -48,10 +43,9 @@ LIMITS = (
 def rows(frames: int, workers: int, task: float, m: Measured) -> Iterator[tuple[str, str]]:
     """Name and value of each figure, and the limits that are met."""
     nodes = frames * m.tasks
-    client, index = m.start + nodes * m.client, nodes * m.index
+    client = m.start + nodes * m.client
     supply = m.scheduler * workers / task  # share of the scheduler's time
     met = {
-        "index": index > m.index_limit,
         "client": client > 4e9,
         "scan": frames * m.scan > 60,
         "scheduler": supply > 1,
@@ -60,7 +54,6 @@ def rows(frames: int, workers: int, task: float, m: Measured) -> Iterator[tuple[
     yield "store", f"{nodes * m.stored / 1e9:.1f} GB"
     yield "client", f"{client / 1e9:.2f} GB"
     yield "planning, all cached", f"{nodes * m.plan:.0f} s"
-    yield "index, unpacked", f"{index / 1e6:.0f} MB"
     yield "slowest task of the whole sequence", f"{frames * m.scan:.0f} s"
     yield f"scheduler, of its time with {workers} workers", f"{100 * supply:.0f} %"
     yield "workers that it can keep busy", f"{task / m.scheduler:.0f}"

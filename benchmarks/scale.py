@@ -4,7 +4,7 @@
 
 Every frame is basic, so that each has all the tasks of a pair. Each stage keeps its ports, arrays, parameters and code
 digest; only what it computes is replaced by a few zeros, committed as ever. Each size runs in a process of its own on
-an empty cache, then is planned by other processes, warm: at once, and on the next day, when files and index are old.
+an empty cache, then is planned by other processes, warm: at once, and on the next day, when files are old.
 Printed are, a node or a task:
 
 - plan: laying out and looking up when all is cached, as ``rille plan`` does

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -25,45 +23,22 @@ README = "export_readme.txt"
 """File beside this module: text of the folder's readme, with fields for the sequence's name, size and notes."""
 
 
-def export(sequence: Sequence, directory: Path, materialise: Materialise) -> Path:
-    """Write a sequence to a folder, wholly or not at all; frames without a pair of images are left out.
+def export(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
+    """Write a sequence to a folder, which is made; frames without a pair of images are left out.
 
     Parameters
     ----------
-    sequence : to write.
-    directory : folder to make; it must not exist yet, or be empty.
     materialise : returns the arrays of a source (from a cache, or by running its stage); also true disparity and DEM of
         the basic pairs by the sequence's own stride, if it has them.
 
     Raises
     ------
     InputError
-        The folder is not empty, or cannot be made; or the images have lens distortion, which the files cannot hold.
+        The images have lens distortion, which the files cannot hold.
     """
     if sequence.lenses:
         text = f"the images of {sequence.name} have lens distortion, which calib.txt cannot say"
         raise InputError("RIL-184", text, remedy="export a sequence without; this one is plain files already")
-    if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-        raise InputError("RIL-165", f"{directory} exists, and is no empty folder", remedy="name another")
-    try:
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the folder to be made, because a rename needs the same file system.
-        part = Path(tempfile.mkdtemp(prefix=f".{directory.name}.", dir=directory.parent))
-    except OSError as error:
-        text = f"{directory} cannot be made: {error.strerror}"
-        raise InputError("RIL-166", text, remedy="name another folder") from error
-    try:
-        _write(sequence, part, materialise)
-        # mkdtemp makes the folder readable for its owner alone.
-        part.chmod(0o755)
-        part.replace(directory)
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    return directory
-
-
-def _write(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
     frames = [k for k in range(sequence.frames) if k not in sequence.lost]
     for camera in CAMERAS:
         for k in frames:

@@ -78,7 +78,7 @@ class Everything(Store):
                 n = self.asked[stage]  # in order of the pairs
                 facts = {"pair": BASIC[n], "cell": LATTICE["cell"], "box": LATTICE, "tiles": TOUCHED[n]}
             self.asked[stage] += 1
-            self.known[key] = Ref(key, stage, digest([stage, key]), facts, 0, 0, 0.0)
+            self.known[key] = Ref(key, stage, digest([stage, key]), facts, 0, 0.0)
         return self.known.get(key)
 
 

@@ -182,8 +182,6 @@ class _Run:
             raise
         else:
             self._close(kill=False)
-            if not self.dry:
-                self.store.note(h.ref for h in self.graph.nodes if h.ref is not None)
         finally:
             self.result.counts.update(h.status for h in self.graph.nodes)
             if not self.dry:
@@ -209,7 +207,6 @@ class _Run:
 
     def _loop(self, interrupts: Interrupts) -> None:
         self.progress.open()
-        self.store.survey(self.graph.sequence)
         while True:
             while self._take() or self._go_on():
                 # An interrupt in a finaliser or a callback of a weak reference was remembered, not raised.
@@ -276,9 +273,7 @@ class _Run:
             refs = handle.refs()
             handle.key = key_of(handle.spec, refs)
             if handle.stage not in self.force:
-                # fresh: the index vouches for a file that nobody wrote since, which the disk may have damaged.
-                fresh = handle.index in self.before
-                handle.ref = self.store.lookup(handle.stage, handle.key, fresh=fresh, use=not self.dry)
+                handle.ref = self.store.lookup(handle.stage, handle.key, use=not self.dry)
                 if handle.ref is not None:
                     self._resolve(handle, "cached")
                     return
@@ -400,7 +395,7 @@ class _Run:
             return False
         self.heals[handle.index] += 1
         for source in {h.index: h for h in handle.upstream()}.values():
-            if source.ref is not None and self.store.lookup(source.stage, source.key, fresh=True) is None:
+            if source.ref is not None and self.store.lookup(source.stage, source.key) is None:
                 self.before[source.index] = source.ref.digest
                 source.reason = "its artifact was found damaged, or gone, when it was read"
                 source.ref, source.status = None, "pending"

@@ -22,7 +22,7 @@ from rille.pipeline.engine.runtime.kernels import use_own_folder
 from rille.pipeline.engine.store.manifest import Ref
 from rille.stages.core.declare import Params, Stage, declared
 
-FORMAT = 4
+FORMAT = 5
 """Enters every key: raise it when the meaning of keys or artifacts changes."""
 
 Refs = Mapping[str, Ref | list[Ref]]

@@ -55,12 +55,13 @@ class Output:
     opens: str
     write: Writer | None = None
     frame: str = ""
-    needs: Reads = lambda _: ()
-    reads: Reads = lambda _: ()
+    needs: Reads = ()
+    reads: Reads = ()
 
-    def names(self, run: RunView) -> tuple[object, ...]:
+    @property
+    def names(self) -> Reads:
         """All products and facts that it takes of a run."""
-        return *self.needs(run), *self.reads(run)
+        return self.needs + self.reads
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:

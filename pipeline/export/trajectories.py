@@ -1,14 +1,13 @@
-"""Files of the trajectory, of the crosscheck's, and of their agreement."""
+"""Files of the trajectory, and of the crosscheck's."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from rille.pipeline.export.comparison import CrosscheckComparison, compare
+from rille.pipeline.export.comparison import crosscheck_poses
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RunView, artifact
-from rille.pipeline.export.writers import FRAME, WORLDS, write_table, write_trajectory_kitti, write_trajectory_tum
+from rille.pipeline.export.writers import FRAME, WORLDS, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
 from rille.stages.odometry.resection.trajectory import world_poses
@@ -39,37 +38,6 @@ def _write_pieces(path: Path, run: RunView) -> None:
             _write_tum(piece, run, world_poses(trajectory, number), number)
 
 
-def _compared(run: RunView) -> CrosscheckComparison:
-    return compare(run, artifact(run, run.products.agreement))
-
-
-def _write_agreement(path: Path, run: RunView) -> None:
-    compared, trajectory = _compared(run), _trajectory(run)
-    names = [run.sequence.frame_names[f] for f in run.frames]
-    columns: dict[str, list[Any]] = {"frame": list(run.frames), "name": names}
-    if run.sequence.times is not None:
-        columns["time_s"] = stamps(run)
-    for prefix, poses in (("", world_poses(trajectory)), ("crosscheck_", compared.poses)):
-        columns |= {f"{prefix}{axis}_m": poses[:, k, 3].tolist() for k, axis in enumerate("xyz")}
-    write_table(path, columns | compared.columns())
-
-
-def _posed(run: RunView) -> tuple[object, ...]:
-    return (run.products.trajectory,)
-
-
-def _times(run: RunView) -> tuple[object, ...]:
-    return (run.sequence.times,)
-
-
-def _agreed(run: RunView) -> tuple[object, ...]:
-    return run.products.agreement, run.products.trajectory
-
-
-def _beside(run: RunView) -> tuple[object, ...]:
-    return run.products.accuracy, run.products.crosscheck_accuracy, run.sequence.times, run.sequence.frame_names
-
-
 OUTPUTS = (
     Output(
         "trajectory.kitti",
@@ -77,7 +45,7 @@ OUTPUTS = (
         "evo (evo_traj kitti), any text editor",
         lambda path, run: write_trajectory_kitti(path, world_poses(_trajectory(run))),
         "world",
-        _posed,
+        ("trajectory",),
     ),
     Output(
         "trajectory.tum",
@@ -85,34 +53,25 @@ OUTPUTS = (
         "evo (evo_traj tum), CloudCompare",
         lambda path, run: _write_tum(path, run, world_poses(_trajectory(run))),
         "world",
-        _posed,
-        _times,
+        ("trajectory",),
+        ("sequence.times",),
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        needs=_posed,
-        reads=_times,
+        needs=("trajectory",),
+        reads=("sequence.times",),
     ),
     Output(
         "crosscheck.tum",
         "the trajectory by COLMAP in the same form, laid on ours without a change of scale",
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
-        lambda path, run: _write_tum(path, run, _compared(run).poses),
+        lambda path, run: _write_tum(path, run, crosscheck_poses(run, artifact(run, run.products.agreement))),
         "world",
-        _agreed,
-        _beside,
-    ),
-    Output(
-        "agreement.csv",
-        "each frame: our position, COLMAP's, their disagreement, whether it is flagged, errors where there is truth",
-        "LibreOffice Calc, any text editor",
-        _write_agreement,
-        "world",
-        _agreed,
-        _beside,
+        ("agreement", "trajectory"),
+        ("sequence.times",),
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

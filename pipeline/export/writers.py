@@ -5,7 +5,6 @@ Every file is written beside its final name and moved there, so that a reader fi
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import math
@@ -80,15 +79,16 @@ class Meaning:
 
 
 def check_folder(folder: Path, ours: str = "") -> None:
-    """Refuse to write a folder that is not empty, unless it holds a file named ``ours`` and so is one of ours.
+    """Refuse to write a folder where there is a file, or a folder with files, unless one of them is named ``ours``.
 
     Raises
     ------
     ConfigError
         It is refused.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not (ours and (folder / ours).exists()):
-        raise ConfigError("RIL-607", f"{folder} is not empty", remedy="give a new folder with --output")
+    taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if taken and not (ours and (folder / ours).exists()):
+        raise ConfigError("RIL-607", f"{folder} exists, and is no empty folder", remedy="name a new one")
 
 
 def write_raster(
@@ -168,27 +168,6 @@ def axes(place: Georeference | None) -> str:
         f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
         f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
     )
-
-
-def write_table(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
-    """Write columns of equal length as CSV (RFC 4180, but lines end in a line feed); unknown values stay empty."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(value) for value in row] for row in zip(*columns.values(), strict=True))
-    atomic.write(path, out.getvalue())
-
-
-def _cell(value: Any) -> str:
-    if value is None or (isinstance(value, float) and not np.isfinite(value)):
-        return ""
-    if isinstance(value, float):
-        # Nine digits are too few for large values, such as seconds since 1970.
-        return f"{value:.9g}" if abs(value) < 1e4 else repr(float(value))
-    # Names come from the author of the data: control characters are escaped, formulas of a spreadsheet quoted.
-    text = plain(str(value))
-    # A spreadsheet runs a cell that begins so as a formula; after an apostrophe it is text.
-    return f"'{text}" if isinstance(value, str) and text.startswith(("=", "+", "-", "@", "\t")) else text
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:

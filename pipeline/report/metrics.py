@@ -117,7 +117,7 @@ def _against_truth(view: RunView, frames: Rows, pairs: Rows) -> dict[str, Metric
 
 
 def _disparity(view: RunView) -> dict[str, Metric]:
-    """Errors of the disparities, each the mean over the pairs; those of each pair are in ``accuracy.json``."""
+    """Errors of the disparities, each the mean over the pairs; those of each pair are in its row."""
     pairs = [facts_of(view, handle).get("metrics") for handle in view.products.disparity_accuracy.values()]
     judged = [figures for figures in pairs if figures]
     by_name = {}

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.export.view import chain
-from rille.pipeline.flow.products import Products
 from rille.pipeline.report import gather
 from rille.pipeline.report.gather import facts_of
 from rille.stages.odometry.resection.loop import closure
@@ -41,6 +40,9 @@ def frames(scene: gather.Scene) -> list[Row]:
                 "error_m": None if track.error is None else finite(track.error[i]),
                 "disagreement_m": None if compared is None else finite(compared.distance[i]),
                 "disagreement_deg": None if compared is None else finite(np.degrees(compared.angle[i])),
+                "step_disagreement_m": None if compared is None else finite(compared.step_distance[i]),
+                "step_disagreement_deg": None if compared is None else finite(np.degrees(compared.step_angle[i])),
+                "crosscheck_error_m": None if compared is None else finite(compared.error_crosscheck[i]),
                 "flagged": compared is not None and bool(compared.flagged[i]),
                 "basic": frame in view.products.disparity,
             }
@@ -66,12 +68,11 @@ def loops(scene: gather.Scene) -> dict[str, list[Row]]:
     return {"loops": rows, "loops_refused": [row for meta in facts for row in meta["refused"]]}
 
 
-def of_pairs(p: Products) -> tuple[object, ...]:
-    """Products that :func:`pairs` reads."""
-    return (
-        *(p.keyframes, p.screening, p.orientations, p.disparity, p.level, p.local_dem, p.local_risk, p.local_path),
-        *(p.local_dem_accuracy, p.seams),
-    )
+OF_PAIRS = (
+    *("keyframes", "screening", "orientations", "disparity", "level", "local_dem", "local_risk", "local_path"),
+    *("disparity_accuracy", "local_dem_accuracy", "seams"),
+)
+"""Products that :func:`pairs` reads."""
 
 
 def pairs(scene: gather.Scene) -> list[Row]:
@@ -89,6 +90,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
         dem, path = facts_of(view, p.local_dem.get(pair)), facts_of(view, p.local_path.get(pair))
         shares = facts_of(view, p.local_risk.get(pair)).get("shares", {})
         judged = facts_of(view, p.local_dem_accuracy.get(pair)).get("metrics", {})
+        matching = facts_of(view, p.disparity_accuracy.get(pair)).get("metrics", {})
         rows.append(
             {
                 "frame": pair,
@@ -107,6 +109,7 @@ def pairs(scene: gather.Scene) -> list[Row]:
                 "rmse_m": judged.get("rmse", {}).get("value"),
                 "completeness": judged.get("completeness", {}).get("value"),
                 "tilt_deg": judged.get("tilt", {}).get("value"),
+                "against_truth": {"disparity": matching, "elevation": judged},
                 "why_basic": why.get(pair),
                 "overlap": overlap.get(pair),
                 "epipolar_px": facts_of(view, p.orientations.get(pair)).get("residual_before_px"),

@@ -118,7 +118,7 @@ WRONG = {
     "datasets export": [
         ("mockup-short", "RIL-001"),
         ("no-such-dataset x", "RIL-276"),
-        ("mockup-short other", "RIL-165"),
+        ("mockup-short other", "RIL-607"),
     ],
     "cache": [("no-such-command", "RIL-001")],
     "cache verify": [("--no-such-option", "RIL-001"), ("--cache no-such-folder", "RIL-589")],

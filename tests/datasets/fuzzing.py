@@ -10,10 +10,8 @@ import json
 import random
 import shutil
 import signal
-import sqlite3
-import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -28,7 +26,6 @@ from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.store.archive import pack
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.index import TABLE, Index
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.engine.store.zarr_group import codec
 from rille.pipeline.export.read_dem import read_raster
@@ -127,20 +124,6 @@ def _lookup(cache: Path, data: bytes) -> None:
     dict(store.open(ref).arrays)
 
 
-def database(path: Path) -> None:
-    (path.parent / "index.sqlite").write_bytes(path.read_bytes())
-    known = Index(path.parent, "s")
-    for key in list(known._rows):
-        known.get("numbers", key, "1.2.3")
-
-
-def index(path: Path) -> None:
-    """A row that is wrong behind a checksum that is right."""
-    known, stated = Index(path.parent, "s"), path.read_bytes().decode(errors="replace")
-    known._rows = {KEY: (stated, zlib.crc32(stated.encode()))}
-    known.get("numbers", KEY, "1.2.3")
-
-
 READERS: dict[str, Callable[[Path], None]] = {
     "manifest": manifest,
     "calibration": calibration,
@@ -155,8 +138,6 @@ READERS: dict[str, Callable[[Path], None]] = {
     "euroc": euroc,
     "packed": packed,
     "artifact": artifact,
-    "database": database,
-    "index": index,
 }
 
 
@@ -174,27 +155,9 @@ MANIFEST = {
     "meta": {"frame": 0},
     "provenance": {"reason": "new"},
 }
-STATED = [
-    "1.2.3",
-    {"key": KEY, "stage": "numbers", "digest": "b" * 64, "meta": {"frame": 0}, "nbytes": 48, "stored": 9},
-]
-
-
-def _database() -> bytes:
-    with closing(sqlite3.connect(":memory:")) as made:
-        made.execute(f"CREATE TABLE {TABLE}")
-        stated = json.dumps(STATED)
-        rows = [("s", f"{k:064d}", stated, zlib.crc32(stated.encode())) for k in range(3)]
-        made.executemany("INSERT INTO artifacts VALUES (?, ?, ?, ?)", rows)
-        made.commit()
-        return made.serialize()
-
-
 MADE: dict[str, bytes] = {
     "artifact/made": json.dumps(MANIFEST).encode(),
-    "packed/made": bytes(pack({"values/c.0.0": CHUNK, "manifest.json": json.dumps(MANIFEST).encode()})),
-    "index/made": json.dumps(STATED).encode(),
-    "database/made": _database(),
+    "packed/made": bytes(pack({"manifest.json": json.dumps(MANIFEST).encode(), "values/c.0.0": CHUNK})),
 }
 """Seeds of what Rille itself writes."""
 

@@ -72,7 +72,7 @@ def test_outputs_are_all_there_and_sound(cold: Path) -> None:
     folder = latest(cold)
     wanted = {"trajectory.kitti", "trajectory.tum", "dem.tif", "dem_sigma.tif", "ortho.tif", "risk.tif", "hazard.tif"}
     wanted |= {"reason.tif", "risk.tif.aux.xml"}
-    wanted |= {"path.gpkg", "frames.json", "crosscheck.tum", "agreement.csv"}
+    wanted |= {"path.gpkg", "frames.json", "crosscheck.tum"}
     wanted |= {"slope.tif", "hillshade.tif", "terrain.zarr"}
     wanted |= {"config.toml", "report.json", "report.html", "ledger.jsonl"}
     assert wanted <= {p.name for p in folder.iterdir()}

@@ -65,7 +65,7 @@ def same_files(whole, where):
     """Names of products that differ from those of the undisturbed run."""
     report = json.loads((where / "runs" / "mockup-short" / "latest" / "report.json").read_text())
     assert report["complete"]
-    names = ("trajectory.kitti", "agreement.csv", "path.gpkg", "dem.tif", "risk.tif")
+    names = ("trajectory.kitti", "crosscheck.tum", "path.gpkg", "dem.tif", "risk.tif")
     both = [[Path(w) / "runs" / "mockup-short" / "latest" / name for w in (whole.where, where)] for name in names]
     return [a.name for a, b in both if a.read_bytes() != b.read_bytes()]
 

@@ -9,10 +9,12 @@ from cyclopts import App
 from rille.datasets import registry
 from rille.datasets.export import export
 from rille.datasets.protocol import Source
+from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.engine.task import ensure
+from rille.pipeline.export.writers import check_folder
 from rille.pipeline.flow import config
 from rille.pipeline.runs.options import Assignments, CacheFolder, cache_folder
 
@@ -43,6 +45,7 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
     store = Store(cache_folder(cache))
     # Before minutes of rendering.
     store.writable()
+    check_folder(directory)
 
     def artifact(source: Source) -> Ref:  # rendering is cached like any other work
         refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}
@@ -50,4 +53,6 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
         return ensure(store.root, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
 
     sequence = registry.open_sequence(seq, for_dataset)
-    print(export(sequence, directory, lambda source: store.open(artifact(source))))
+    with atomic.replacing(directory) as folder:
+        export(sequence, folder, lambda source: store.open(artifact(source)))
+    print(directory)

@@ -1,6 +1,6 @@
 """The file of one artifact: a zip archive that any reader of zip files opens.
 
-Its members are a zarr 3 group and, as the last one, the manifest. They are stored as they are (zarr has compressed the
+Its members are the manifest, as the first one, and a zarr 3 group. They are stored as they are (zarr has compressed the
 arrays), so that no member unpacks to more than it has, and have a CRC-32 each, which is compared at every reading.
 """
 
@@ -12,6 +12,7 @@ import os
 import stat
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -19,6 +20,13 @@ from functools import lru_cache
 from rille.datasets.text.reading import mark
 
 MANIFEST = "manifest.json"
+
+HEADER = struct.Struct("<4s5H3I2H")
+"""Before each member: signature, three numbers (the last is the compression), date and time, CRC-32, two sizes, lengths
+of name and more."""
+
+END = b"PK\x05\x06"
+"""Beginning of the last 22 bytes of an archive."""
 
 MAX_READ_BYTES = 4_000_000
 """Bound of one reading, and so of the archive's directory, which is read at once: some 40 000 members."""
@@ -88,6 +96,27 @@ def pack(members: Mapping[str, bytes]) -> memoryview:
 
 
 @contextmanager
+def manifest(path: str, most: int) -> Iterator[tuple[bytes, int]]:
+    """The manifest in the file of an artifact, of at most ``most`` bytes, and the size of the file, bytes.
+
+    A look-up needs no more: to read the archive's directory would take three times as long. That the file has an end
+    shows that it was not cut off. Errors are those of :func:`opened`.
+    """
+    with _broken(), _RegularFile(path) as raw, io.BufferedReader(raw) as file:
+        whole = os.fstat(file.fileno()).st_size
+        signature, _, _, packing, _, _, checksum, size, _, name, more = HEADER.unpack(file.read(HEADER.size))
+        if (signature, packing, file.read(name)) != (b"PK\x03\x04", zipfile.ZIP_STORED, MANIFEST.encode()):
+            raise BrokenError(f"{MANIFEST} is missing")
+        if more or size > min(most, whole):
+            raise BrokenError(f"{MANIFEST} claims {size} bytes")
+        data = file.read(size)
+        file.seek(-22, os.SEEK_END)
+        if zlib.crc32(data) != checksum or file.read(len(END)) != END:
+            raise BrokenError(f"{MANIFEST} is damaged, or the file is cut off")
+        yield data, whole
+
+
+@contextmanager
 def opened(path: str) -> Iterator[Archive]:
     """The file of an artifact.
 
@@ -98,8 +127,15 @@ def opened(path: str) -> Iterator[Archive]:
     FileNotFoundError
         There is none.
     """
-    try:
+    with _broken():
         yield _kept(path, mark(os.stat(path)))
+
+
+@contextmanager
+def _broken() -> Iterator[None]:
+    """Turn what readers say of a damaged file into :class:`BrokenError`."""
+    try:
+        yield
     except MALFORMED as error:
         raise BrokenError(str(error)) from None
     except OSError as error:

@@ -4,7 +4,6 @@ Files in the cache folder::
 
     artifacts/<stage>/<k>/<key>.zarr.zip    an artifact, one file; <k> are the key's first two digits
     quarantine/<stage>-<key>-<unique>*      a damaged artifact, and the reason, set aside
-    index.sqlite                            what artifacts state (rille.pipeline.engine.store.index)
     hints/<sequence>/                       of its earlier runs, for explanations and plans; never a matter
                                             of correctness
     roots/<digest>.json                     folders of runs that use the cache
@@ -23,7 +22,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,6 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.store import archive, folder, manifest
 from rille.pipeline.engine.store.archive import BrokenError
 from rille.pipeline.engine.store.folder import StoreError
-from rille.pipeline.engine.store.index import Index
 from rille.pipeline.engine.store.lazy_arrays import LazyArrays
 from rille.pipeline.engine.store.manifest import Manifest, Ref, artifact_path
 from rille.pipeline.engine.store.output_digest import array_digests, output_digest
@@ -67,24 +65,11 @@ class Store:
 
     def __init__(self, cache: Path | str) -> None:
         self.root = folder.locate(cache).absolute()
-        self._index: Index | None = None
 
     def hints(self, sequence: str) -> Path:
         """Folder of what earlier runs of a sequence leave for explanations and plans."""
         # No name leads out of the folder.
         return self.root / "hints" / (quote(sequence, safe="").replace(".", "%2E") or "-")
-
-    def survey(self, sequence: str) -> None:
-        """Before many look-ups: read the index of earlier runs, which spares the manifests of what it names.
-
-        ``sequence`` is the name of the sequence that the runs are of.
-        """
-        self._index = Index(self.root, sequence)
-
-    def note(self, refs: Iterable[Ref]) -> None:
-        """Enter into the index, at the end of a run, the artifacts that it used. Best effort."""
-        if self._index is not None:
-            self._index.note(refs)
 
     def writable(self) -> None:
         """Raise if nothing can be written here.
@@ -100,24 +85,21 @@ class Store:
                 file.write(b"\0" * 4096)  # an empty file fits on a full disk
                 file.flush()
 
-    def lookup(self, stage: str, key: str, *, fresh: bool = False, use: bool = True) -> Ref | None:
-        """The artifact of a key; one whose directory or manifest is damaged is set aside and counts as absent.
+    def lookup(self, stage: str, key: str, *, use: bool = True) -> Ref | None:
+        """The artifact of a key; one whose manifest is damaged, or whose file has no end, is set aside and counts as
+        absent.
 
-        ``fresh`` does not rely on the index. With ``use`` clearing up leaves it alone from now on.
+        With ``use`` clearing up leaves it alone from now on.
         """
+        path = f"{self.root}/{artifact_path(stage, key)}"  # no Path: a plan asks tens of thousands of times
+        # Without the rights for it nobody clears it up; if it has just gone, that is seen below.
+        with suppress(OSError):
+            # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares what was
+            # touched
+            if use and os.stat(path).st_mtime < time.time() - 3600.0:
+                os.utime(path)
         try:
-            with folder.clear_errors(self.root):
-                path = f"{self.root}/{artifact_path(stage, key)}"  # no Path: a plan asks tens of thousands of times
-                status = os.stat(path)
-                index = None if fresh else self._index
-                known = index.get(stage, key, folder.mark(status)) if index else None
-                # Age of a file that a look-up touches, seconds: well below the grace of clearing up, which spares
-                # what was touched
-                if use and status.st_mtime < time.time() - 3600.0:
-                    # Without the rights for it nobody clears it up; if it has just gone, its reader says so.
-                    with suppress(OSError):
-                        os.utime(path)
-                return known or manifest.reference(self.read_manifest(stage, key), status.st_size)
+            return manifest.reference(self.read_manifest(stage, key))
         except FileNotFoundError:
             return None
         except BrokenError as error:
@@ -139,8 +121,8 @@ class Store:
         BrokenError, FileNotFoundError
             It is not readable; there is none.
         """
-        with self.opened(stage, key) as file:
-            return manifest.read_manifest(file, stage, key)
+        with folder.clear_errors(self.root):
+            return manifest.read_manifest(f"{self.root}/{artifact_path(stage, key)}", stage, key)
 
     @contextmanager
     def opened(self, stage: str, key: str) -> Iterator[archive.Archive]:
@@ -190,15 +172,14 @@ class Store:
             "meta": json.loads(json.dumps(bundle.meta)),
             "provenance": dict(provenance or {}),
         }
-        content = archive.pack({**members, archive.MANIFEST: json.dumps(made, allow_nan=False).encode()})
+        content = archive.pack({archive.MANIFEST: json.dumps(made, allow_nan=False).encode(), **members})
         path = artifact_path(stage.name, key)
         # Another process may publish, damage or remove the same artifact between any two of these steps.
         for _ in range(3):
             with folder.clear_errors(self.root):
                 if atomic.create(self.root / path, content):
-                    return manifest.reference(made, len(content))
-            # fresh: the index vouches for a file that nobody wrote since, which the disk may have damaged.
-            there = self.lookup(stage.name, key, fresh=True)  # a damaged one is set aside
+                    return manifest.reference(made)
+            there = self.lookup(stage.name, key)  # a damaged one is set aside
             if there is not None and there.digest == digest:
                 return there
             old = self.manifest(stage.name, key)

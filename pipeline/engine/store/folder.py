@@ -5,18 +5,13 @@ from __future__ import annotations
 import errno
 import os
 import re
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rille.datasets.text import reading
 from rille.pipeline.engine.failures import CLOSED, FULL, remedy_of
 from rille.stages.core.errors import ConfigError, RilleError
-
-RACY_S = 0.1
-"""Seconds: a file that was changed so short a time ago might change again within one tick of the clock."""
 
 
 class StoreError(RilleError):
@@ -65,8 +60,3 @@ def quarantine(path: Path, root: Path, name: str) -> Path:
     aside.parent.mkdir(parents=True, exist_ok=True)
     os.rename(path, aside)
     return aside
-
-
-def mark(status: os.stat_result) -> str:
-    """Inode, size and times of a file (:func:`reading.mark`); empty: it might change, and keep them."""
-    return "" if max(status.st_mtime, status.st_ctime) > time.time() - RACY_S else reading.mark(status)

@@ -6,10 +6,8 @@ import re
 import time
 from collections import defaultdict
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 
 from rille.pipeline.engine.failures import CLOSED
-from rille.pipeline.engine.store import index
 from rille.pipeline.engine.store.archive import BrokenError
 from rille.pipeline.engine.store.base import GoneError, Store
 from rille.pipeline.engine.store.folder import clear_errors, files
@@ -92,9 +90,6 @@ def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bo
         except OSError as error:
             if error.errno in CLOSED:  # else somebody else cleared it away
                 refused.append(error)
-    if cleared and not dry_run:
-        with suppress(OSError):
-            (store.root / index.NAME).unlink()  # it only grows, and the next run writes it anew
     if refused:
         with clear_errors(store.root):
             raise refused[0]

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Generic
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt
 
-from rille.pipeline.engine.store.archive import MANIFEST, Archive, BrokenError
+from rille.pipeline.engine.store import archive
+from rille.pipeline.engine.store.archive import BrokenError
 from rille.stages.core.declare import F
 
 Manifest = dict[str, Any]
@@ -53,7 +54,7 @@ class _Manifest(BaseModel, strict=True):
 class Ref(Generic[F]):
     """A committed artifact: all that travels between tasks.
 
-    ``nbytes`` are bytes of the decoded arrays, ``stored`` those of the file; ``seconds`` are those that its stage took.
+    ``nbytes`` are bytes of the decoded arrays; ``seconds`` are those that its stage took.
     """
 
     key: str
@@ -61,7 +62,6 @@ class Ref(Generic[F]):
     digest: str
     meta: F
     nbytes: int
-    stored: int
     seconds: float
 
     @property
@@ -75,33 +75,34 @@ def artifact_path(stage: str, key: str) -> str:
     return f"artifacts/{stage}/{key[:2]}/{key}.zarr.zip"
 
 
-def read_manifest(archive: Archive, stage: str, key: str) -> Manifest:
-    """Manifest of the artifact of a key.
+def read_manifest(path: str, stage: str, key: str) -> Manifest:
+    """Manifest of the artifact of a key, in the file at ``path``.
 
     Its checksum may be right by intent: it has every entry, and its arrays claim no more than such a file can hold.
 
     Raises
     ------
-    BrokenError
-        The archive holds no such manifest.
+    BrokenError, FileNotFoundError
+        The file holds no such manifest; there is none.
     """
-    manifest: Manifest = json.loads(archive.member(MANIFEST, 256_000_000))  # bytes at most
-    _Manifest.model_validate(manifest)
-    if (manifest["stage"], manifest["key"]) != (stage, key):
-        raise BrokenError("the manifest is that of another artifact")
-    for name, about in manifest["arrays"].items():
-        edges = zip(about["chunks"], about["shape"], strict=True)
-        # Bytes of a decoded array for one of the file: lz4 makes 255 of one
-        if _nbytes(about) > 1000 * archive.size or any(edge > max(n, 1) for edge, n in edges):
-            raise BrokenError(f"{name} claims more than the file holds")
-    return manifest
+    with archive.manifest(path, 256_000_000) as (content, size):
+        manifest: Manifest = json.loads(content)
+        _Manifest.model_validate(manifest)
+        if (manifest["stage"], manifest["key"]) != (stage, key):
+            raise BrokenError("the manifest is that of another artifact")
+        for name, about in manifest["arrays"].items():
+            edges = zip(about["chunks"], about["shape"], strict=True)
+            # Bytes of a decoded array for one of the file: lz4 makes 255 of one
+            if _nbytes(about) > 1000 * size or any(edge > max(n, 1) for edge, n in edges):
+                raise BrokenError(f"{name} claims more than the file holds")
+        return manifest
 
 
-def reference(manifest: Manifest, stored: int = 0) -> Ref:
-    """Reference to the artifact of a manifest, whose file has ``stored`` bytes."""
+def reference(manifest: Manifest) -> Ref:
+    """Reference to the artifact of a manifest."""
     nbytes = sum(map(_nbytes, manifest["arrays"].values()))
     seconds = manifest["provenance"].get("seconds", 0.0)
-    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["meta"], nbytes, stored, seconds)
+    return Ref(manifest["key"], manifest["stage"], manifest["digest"], manifest["meta"], nbytes, seconds)
 
 
 def _nbytes(about: Mapping[str, Any]) -> int:

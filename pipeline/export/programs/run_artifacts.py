@@ -34,9 +34,10 @@ def export_run(form: str, run: Path, target: Path, store: Store, **thinning: flo
     InputError
         The run has nothing for this form, or its artifacts are gone from the cache.
     ConfigError
-        ``target`` is a folder that is not empty.
+        A folder is to be written, and ``target`` is no empty one.
     """
-    check_folder(target)
+    if form not in FILES:
+        check_folder(target)
     module = Path(FILES.get(form, form)).stem
     write_run = import_module(f"rille.pipeline.export.programs.{module}").write_run
     with atomic.replacing(target) as temporary:

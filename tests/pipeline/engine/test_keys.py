@@ -127,7 +127,7 @@ def test_a_task_s_key_is_the_digest_of_its_recipe_with_one_for_what_its_stage_s_
     spec = Spec(
         "toys.scale", 'scale/"0"', ScaleParams(offset=0.5), {"pair": 3, "at": [0.1, None], "a": {"z": 1, "b": 2}}
     )
-    one, other = (Ref(k * 64, "numbers", k * 64, {}, 0, 0, 0.0) for k in "ab")
+    one, other = (Ref(k * 64, "numbers", k * 64, {}, 0, 0.0) for k in "ab")
     for refs in ({"values": one}, {"values": other}, {"values": [one, other]}, {}):
         made = recipe(spec, refs)
         shared = {name: made.pop(name) for name in ("code", "env", "format", "stage", "version")}

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import io
 
 import pytest
@@ -9,7 +8,6 @@ from hypothesis import strategies as st
 
 from rille.pipeline import cli
 from rille.pipeline.engine.plain import UNSEEN, PlainStream, plain, plain_output
-from rille.pipeline.export.writers import write_table
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202etxt.\x9b1m"
 
@@ -53,12 +51,3 @@ def test_a_complaint_is_one_line_of_a_bounded_length(tmp_path, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("rille: error RIL-223")
     assert len(line) < 1100
-
-
-def test_no_cell_of_a_table_is_a_formula(tmp_path):
-    names = ["=1+2", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "plain", "a=b"]
-    write_table(tmp_path / "t.csv", {"frame": range(8), "name": names, "value": [-1.5, *range(-1, 6)]})
-    with (tmp_path / "t.csv").open(newline="") as file:
-        rows = list(csv.reader(file))[1:]
-    assert [row[1] for row in rows] == ["'=1+2", "'+1", "'-1", "'@SUM(A1)", "'\t=1", "\\r=1", "plain", "a=b"]
-    assert [float(row[2]) for row in rows] == [-1.5, -1, 0, 1, 2, 3, 4, 5], "numbers stay numbers"

@@ -132,7 +132,6 @@ def test_an_artifact_is_one_file_that_any_reader_of_zip_files_finds_sound(cache)
         assert {m.compress_type for m in archive.infolist()} == {zipfile.ZIP_STORED}
         assert {m.date_time for m in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, "equal results make equal files"
         assert json.loads(archive.read("manifest.json"))["digest"] == ref.digest
-    assert ref.stored == (cache / ref.path).stat().st_size
 
 
 def test_what_another_run_has_put_there_meanwhile_is_not_taken_for_ours(cache):
@@ -258,6 +257,9 @@ def test_what_no_archive_is_neither_blocks_nor_fills_the_memory(cache, way):
     ref = commit(cache)
     way(file_of(cache))
     began = time.process_time()
+    if way is directory_of_gigabytes:  # which only readers of arrays look at
+        with raises("RIL-504"):
+            Store(cache).open(ref)["elevation"]
     assert Store(cache).lookup("toy", KEY) is None
     assert time.process_time() - began < 1.0
     assert commit(cache) == ref

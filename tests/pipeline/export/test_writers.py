@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from rille.pipeline.export.writers import (
     Meaning,
     write_image,
     write_raster,
-    write_table,
     write_trajectory_kitti,
     write_trajectory_tum,
 )
@@ -165,26 +163,6 @@ def test_equal_paths_make_equal_files(tmp_path: Path) -> None:
     digests = {hashlib.sha256((tmp_path / name / "path.gpkg").read_bytes()).hexdigest() for name in "ab"}
     assert len(digests) == 1
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["path.gpkg"]
-
-
-def test_tables_leave_empty_what_is_not_known(tmp_path: Path) -> None:
-    write_table(
-        tmp_path / "a.csv", {"frame": [1, 2], "name": ["a,b", "c"], "x_m": [0.25, float("nan")], "y": [None, 3]}
-    )
-    rows = list(csv.DictReader((tmp_path / "a.csv").open()))
-    assert rows == [
-        {"frame": "1", "name": "a,b", "x_m": "0.25", "y": ""},
-        {"frame": "2", "name": "c", "x_m": "", "y": "3"},
-    ]
-
-
-def test_times_since_1970_keep_their_microseconds(tmp_path: Path) -> None:
-    write_table(tmp_path / "a.csv", {"time_s": [1403636579.763555, 1403636579.813555, 0.1 + 0.2]})
-    rows = [row["time_s"] for row in csv.DictReader((tmp_path / "a.csv").open())]
-    assert rows[2] == "0.3"
-    write_table(tmp_path / "b.csv", {"time_s": [99999.999999]})
-    assert "99999.999999" in (tmp_path / "b.csv").read_text()
-    np.testing.assert_allclose(np.array(rows[:2], float) - 1403636579, [0.763555, 0.813555], atol=1e-5)
 
 
 def test_a_trajectory_keeps_all_digits_of_its_times(tmp_path: Path) -> None:

@@ -98,7 +98,9 @@ def test_the_other_program_is_compared_frame_by_frame(self_checked: Written) -> 
     assert [r["flagged"] for r in rows] == [False, False, False, True, False, False]
     assert rows[3]["disagreement_m"] == 0.002
     assert rows[3]["disagreement_deg"] == pytest.approx(0.5)
-    assert rows[5]["disagreement_m"] is None
+    assert rows[3]["step_disagreement_m"] == 0.002
+    assert (rows[5]["disagreement_m"], rows[5]["crosscheck_error_m"]) == (None, None)
+    assert facts["crosscheck"]["flagged"] == [{"frame": 3, "why": ["position", "rotation"]}]
     assert found["agreement_rmse"]["value"] == 9e-4
     assert found["agreement_rmse"]["completeness"] == "5 of 6 frames"
     assert found["agreement_flagged"]["value"] == 1

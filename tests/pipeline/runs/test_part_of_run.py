@@ -67,7 +67,7 @@ def test_the_files_of_a_stage_are_those_that_read_nothing_else(chain: Chain) -> 
     graph, _ = part(chain, ("trajectory",))
     files = {h.label.removeprefix("output/") for h in graph.nodes if h.label.startswith("output/")}
     assert {"trajectory.tum", "trajectory.kitti", "facts"} <= files
-    assert {"agreement.csv", "dem.tif", "path.gpkg"}.isdisjoint(files)
+    assert {"crosscheck.tum", "dem.tif", "path.gpkg"}.isdisjoint(files)
 
 
 @pytest.mark.parametrize(

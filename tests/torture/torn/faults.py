@@ -5,13 +5,12 @@ from __future__ import annotations
 import errno
 import io
 import os
-import sqlite3
 import threading
 from pathlib import Path
 
 
 class Faults:
-    """Patches ``os``, ``io`` and ``sqlite3``; ``fail_at`` counts steps from 1, ``onwards`` fails all from there on."""
+    """Patches ``os`` and ``io``; ``fail_at`` counts steps from 1, ``onwards`` fails all from there on."""
 
     def __init__(self, monkeypatch, root, *, code=errno.ENOSPC, fail_at=0, onwards=False):
         self.root, self.code, self.fail_at, self.onwards = str(root), code, fail_at, onwards
@@ -22,7 +21,6 @@ class Faults:
         monkeypatch.setattr(Path, "touch", self._around(Path.touch, "touch", 0))
         monkeypatch.setattr(os, "fsync", self._fsync(os.fsync))
         monkeypatch.setattr(io, "open", self._open(io.open))
-        monkeypatch.setattr(sqlite3, "connect", self._connect(sqlite3.connect))
 
     def _below(self, path):
         return isinstance(path, str | Path) and str(path).startswith(self.root)
@@ -52,17 +50,6 @@ class Faults:
             if self._below(os.readlink(f"/proc/self/fd/{handle}")):
                 self.step("fsync")
             return real(handle)
-
-        return wrapped
-
-    def _connect(self, real):
-        def wrapped(address, *args, **kwargs):
-            if address.startswith(f"file://{self.root}") and address.endswith("mode=rw"):
-                try:
-                    self.step("sqlite")
-                except OSError as error:
-                    raise sqlite3.OperationalError(str(error)) from None
-            return real(address, *args, **kwargs)
 
         return wrapped
 
