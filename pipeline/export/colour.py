@@ -22,8 +22,10 @@ LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in grey (ITU-R BT.601), as in the conversion of the images to grey."""
 
 
-READS = "images", "trajectory", "rigs", "sequence.rig"
-"""Inputs of the colours besides the merged terrain."""
+def reads(run: RunView) -> tuple[object, ...]:
+    """Inputs of the colours besides the merged terrain."""
+    p = run.products
+    return p.images, p.trajectory, p.rigs, run.sequence.rig
 
 
 def coloured(view: RunView, source: NDArray[Any]) -> bool:

@@ -55,13 +55,12 @@ class Output:
     opens: str
     write: Writer | None = None
     frame: str = ""
-    needs: Reads = ()
-    reads: Reads = ()
+    needs: Reads = lambda _: ()
+    reads: Reads = lambda _: ()
 
-    @property
-    def names(self) -> Reads:
+    def names(self, run: RunView) -> tuple[object, ...]:
         """All products and facts that it takes of a run."""
-        return self.needs + self.reads
+        return *self.needs(run), *self.reads(run)
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:

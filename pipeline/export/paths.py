@@ -127,8 +127,8 @@ OUTPUTS = (
         "QGIS, GDAL",
         lambda path, run: write_path(path, artifact(run, run.products.world_path), run.sequence.georeference),
         "world",
-        ("world_path",),
-        ("sequence.georeference",),
+        lambda run: (run.products.world_path,),
+        lambda run: (run.sequence.georeference,),
     ),
 )
 STAGE = stage("output.paths", "The path as a file", OUTPUTS)

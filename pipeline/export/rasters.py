@@ -137,17 +137,26 @@ def _vehicle(risk: Bundle) -> dict[str, str]:
     return {"vehicle": json.dumps(risk.meta.get("vehicle", {}))}
 
 
+def _terrain(run: RunView) -> tuple[object, ...]:
+    """The merged terrain, as a whole: failed tiles must not look like unknown terrain."""
+    return (run.products.world_tiles,)
+
+
+def _world_risk(run: RunView) -> tuple[object, ...]:
+    return (run.products.world_risk,)
+
+
 def _raster(
-    name: str, what: str, make: Callable[[RunView], Raster], needs: str = "world_tiles", reads: Reads = ()
+    name: str, what: str, make: Callable[[RunView], Raster], needs: Reads = _terrain, reads: Reads = lambda _: ()
 ) -> Output:
-    """Row of a raster; of terrain it needs all tiles: failed ones must not look like unknown terrain."""
+    """Row of a raster."""
 
     def write(path: Path, run: RunView) -> None:
         lattice, bands, meaning = make(run)
         cells = {name: v.astype(np.float32) if v.dtype.kind == "f" else v for name, v in bands.items()}
         write_raster(path, cells, lattice, meaning, run.sequence.georeference)
 
-    return Output(name, what, GIS, write, "world", (needs,), ("sequence.georeference", *reads))
+    return Output(name, what, GIS, write, "world", needs, lambda run: (run.sequence.georeference, *reads(run)))
 
 
 OUTPUTS = (
@@ -159,11 +168,11 @@ OUTPUTS = (
         "ortho.tif",
         "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
         _ortho,
-        reads=colour.READS,
+        reads=colour.reads,
     ),
-    _raster("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _risk, "world_risk"),
-    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, needs=("world_risk",)),
-    _raster("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _hazard, "world_risk"),
-    _raster("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _reasons, "world_risk"),
+    _raster("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _risk, _world_risk),
+    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, needs=_world_risk),
+    _raster("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _hazard, _world_risk),
+    _raster("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _reasons, _world_risk),
 )
 STAGE = stage("output.rasters", "Rasters of the terrain and its hazards", OUTPUTS)

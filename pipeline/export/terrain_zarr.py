@@ -123,8 +123,8 @@ OUTPUTS = (
         "xarray.open_zarr, GDAL",
         _write_output,
         "world",
-        ("world_tiles",),
-        ("sequence.name", "sequence.georeference"),
+        lambda run: (run.products.world_tiles,),
+        lambda run: (run.sequence.name, run.sequence.georeference),
     ),
 )
 STAGE = stage("output.terrain", "The merged terrain as one zarr group", OUTPUTS)

@@ -38,6 +38,14 @@ def _write_pieces(path: Path, run: RunView) -> None:
             _write_tum(piece, run, world_poses(trajectory, number), number)
 
 
+def _posed(run: RunView) -> tuple[object, ...]:
+    return (run.products.trajectory,)
+
+
+def _times(run: RunView) -> tuple[object, ...]:
+    return (run.sequence.times,)
+
+
 OUTPUTS = (
     Output(
         "trajectory.kitti",
@@ -45,7 +53,7 @@ OUTPUTS = (
         "evo (evo_traj kitti), any text editor",
         lambda path, run: write_trajectory_kitti(path, world_poses(_trajectory(run))),
         "world",
-        ("trajectory",),
+        _posed,
     ),
     Output(
         "trajectory.tum",
@@ -53,16 +61,16 @@ OUTPUTS = (
         "evo (evo_traj tum), CloudCompare",
         lambda path, run: _write_tum(path, run, world_poses(_trajectory(run))),
         "world",
-        ("trajectory",),
-        ("sequence.times",),
+        _posed,
+        _times,
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        needs=("trajectory",),
-        reads=("sequence.times",),
+        needs=_posed,
+        reads=_times,
     ),
     Output(
         "crosscheck.tum",
@@ -70,8 +78,8 @@ OUTPUTS = (
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
         lambda path, run: _write_tum(path, run, crosscheck_poses(run, artifact(run, run.products.agreement))),
         "world",
-        ("agreement", "trajectory"),
-        ("sequence.times",),
+        lambda run: (run.products.agreement, run.products.trajectory),
+        _times,
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from operator import attrgetter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -110,13 +109,13 @@ class Part(SimpleNamespace):
         return artifact
 
 
-Reads = tuple[str, ...]
-"""Names of parts of a run, such as ``sequence.rig``; one without a dot is a product."""
+Reads = Callable[[RunView], tuple[object, ...]]
+"""Names a part of a run, such as ``lambda run: (run.products.trajectory, run.sequence.rig)``."""
 
 
-def value(run: RunView, name: str) -> Any:
-    """A part of a run by its name."""
-    return attrgetter(name if "." in name else f"products.{name}")(run)
+def names(reads: Reads) -> list[str]:
+    """Dotted names of the attributes that ``reads`` takes, such as ``products.trajectory``."""
+    return [str(name) for name in reads(cast(RunView, _Name()))]
 
 
 def artifact(run: RunView, handle: Any) -> Bundle:
@@ -148,10 +147,24 @@ def chain(run: RunView) -> tuple[int, ...]:
 def part(run: RunView, reads: Reads) -> RunView:
     """The part of a run that ``reads`` names, and its frames, without access to anything else."""
     named = Part(frames=run.frames)
-    for name in reads:
-        *path, last = name.split(".") if "." in name else ("products", name)
+    for name in names(reads):
+        *path, last = name.split(".")
+        source: Any = run
         target: Any = named
         for step in path:
-            target = vars(target).setdefault(step, Part())
-        setattr(target, last, value(run, name))
+            source, target = getattr(source, step, None), vars(target).setdefault(step, Part())
+        setattr(target, last, getattr(source, last, None))
     return cast(RunView, named)
+
+
+class _Name:
+    """Dotted name of an attribute, built by attribute access, so that type checkers see it, unlike a quoted name."""
+
+    def __init__(self, name: str = "") -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> _Name:
+        return _Name(f"{self._name}.{name}".lstrip("."))
+
+    def __str__(self) -> str:
+        return self._name

@@ -305,7 +305,8 @@ def _vehicle(view: RunView) -> Items:
 
 
 def _crosscheck_off(view: RunView) -> Items:
-    if len(view.frames) < 2 or view.products.crosscheck is not None or view.config.crosscheck.enabled:
+    params = getattr(view.config, "crosscheck", None)
+    if len(view.frames) < 2 or view.products.crosscheck is not None or params is None or params.enabled:
         return []
     why = "the crosscheck is switched off (crosscheck.enabled = false)"
     return [_item("crosscheck", "No second opinion on the trajectory", why)]

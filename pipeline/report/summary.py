@@ -427,13 +427,15 @@ NOT_IN_FACTS = ("images", "world_dem")
 """Products that the facts are not made of."""
 
 
-READS = (
-    *(product.name for product in fields(Products) if product.name not in NOT_IN_FACTS),
-    *("config.vehicle", "config.rig.significance", "config.crosscheck.enabled"),
-    *(f"sequence.{name}" for name in ("name", "frames", "frame_names", "rig", "truth", "truth_source")),
-    *(f"sequence.{name}" for name in ("truth_positions", "warnings", "notes", "evaluation_window", "georeference")),
-    *(f"sequence.{name}" for name in ("times", "pitch", "attitude", "imu_axes")),
-)
+def _reads(run: RunView) -> tuple[object, ...]:
+    s, config = run.sequence, run.config
+    return (
+        *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
+        *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
+        *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
+        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes),
+    )
 
-OUTPUTS = (Output("facts", "", "", _write, reads=READS),)
+
+OUTPUTS = (Output("facts", "", "", _write, reads=_reads),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

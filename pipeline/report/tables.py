@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from rille.pipeline.export.view import chain
+from rille.pipeline.flow.products import Products
 from rille.pipeline.report import gather
 from rille.pipeline.report.gather import facts_of
 from rille.stages.odometry.resection.loop import closure
@@ -68,11 +69,12 @@ def loops(scene: gather.Scene) -> dict[str, list[Row]]:
     return {"loops": rows, "loops_refused": [row for meta in facts for row in meta["refused"]]}
 
 
-OF_PAIRS = (
-    *("keyframes", "screening", "orientations", "disparity", "level", "local_dem", "local_risk", "local_path"),
-    *("disparity_accuracy", "local_dem_accuracy", "seams"),
-)
-"""Products that :func:`pairs` reads."""
+def of_pairs(p: Products) -> tuple[object, ...]:
+    """Products that :func:`pairs` reads."""
+    return (
+        *(p.keyframes, p.screening, p.orientations, p.disparity, p.level, p.local_dem, p.local_risk, p.local_path),
+        *(p.disparity_accuracy, p.local_dem_accuracy, p.seams),
+    )
 
 
 def pairs(scene: gather.Scene) -> list[Row]:

@@ -21,7 +21,7 @@ from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import FORMS, Output, unpack
-from rille.pipeline.export.view import Part, RunView, TaskRow, part, value
+from rille.pipeline.export.view import Part, RunView, TaskRow, part
 from rille.pipeline.export.writers import write_json
 from rille.pipeline.report import gallery, summary
 from rille.pipeline.report.canvas import FIGURE
@@ -81,8 +81,7 @@ def handles(output: Output, run: RunView) -> list[Handle]:
 
 def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
     """Add the task that makes an output of ``module``; None if a product that it needs is missing."""
-    needed = [value(run, name) for name in output.needs]
-    if not all(one and all(map(_due, _handles(one))) for one in needed):
+    if not all(needed and all(map(_due, _handles(needed))) for needed in output.needs(run)):
         return None
     there: dict[Handle, int] = {}
     args = {"file": output.name, "run": _form(part(run, output.names), there, _due)}

@@ -24,7 +24,7 @@ from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import Output, pack, unpack
-from rille.pipeline.export.view import part, value
+from rille.pipeline.export.view import part
 from rille.pipeline.report import canvas, gallery
 from rille.pipeline.report.canvas import FIGURE
 from rille.pipeline.runs import run_files
@@ -88,8 +88,8 @@ def run(place: Georeference | None = None) -> Any:
         return [handle(v) for v in value] if isinstance(value, list) else value
 
     products = checked()
-    for name, found in vars(products).items():
-        setattr(products, name, handle(found))
+    for name, value in vars(products).items():
+        setattr(products, name, handle(value))
     where = replace(sequence(truth=True), georeference=place)
     config = SimpleNamespace(**vars(view().config), select=SimpleNamespace(rule="overlap", overlap=0.7))
     bundle = lambda found: None if found is None or found.ref is None else made[found.ref]  # noqa: E731
@@ -115,7 +115,7 @@ def test_a_task_makes_of_what_its_row_names_what_the_whole_run_would(
 ) -> None:
     whole, made = run(georeference)
     assert output.write is not None
-    if all(value(whole, name) for name in output.needs):
+    if all(output.needs(whole)):
         output.write(tmp_path / output.name, whole)
     found = unpack(made_by(laid_out(output.name, whole), made))
     assert found == unpack(pack(tmp_path))
@@ -125,7 +125,7 @@ def test_a_task_makes_of_what_its_row_names_what_the_whole_run_would(
 
 def test_nothing_but_what_is_named_of_a_run_is_within_reach() -> None:
     whole, _ = run()
-    named = part(whole, ("world_risk", "sequence.name"))
+    named = part(whole, lambda run: (run.products.world_risk, run.sequence.name))
     assert named.products.world_risk is whole.products.world_risk
     assert (named.sequence.name, named.frames) == ("bed", FRAMES)
     for lost in (lambda run: run.products.world_path, lambda run: run.sequence.truth):

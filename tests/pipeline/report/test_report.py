@@ -239,9 +239,7 @@ def test_a_stop_without_a_local_path_is_told_but_lacks_nothing(tmp_path: Path) -
 
 def test_a_path_says_where_it_starts_when_that_is_not_at_the_vehicle(tmp_path: Path) -> None:
     """It starts 0.21 m ahead of the camera: within the length of the default rover, but two of a rover at 1:10."""
-    config = SimpleNamespace(
-        vehicle=vehicle_at_scale(), risk=RiskParams(), path=PathParams(), crosscheck=SimpleNamespace(enabled=True)
-    )
+    config = SimpleNamespace(vehicle=vehicle_at_scale(), risk=RiskParams(), path=PathParams())
     facts, _, _, _ = written(tmp_path, view(config=config))
     assert facts["metrics"]["path_start"]["value"] == pytest.approx(0.21)
     assert "starts 0.210 m" in facts["verdict"]

@@ -253,9 +253,7 @@ def test_standard_deviations_are_not_judged_by_truth_that_was_misread(warnings, 
 
 @pytest.mark.parametrize(("source", "told"), [(UNSTATED, True), ("user", False)])
 def test_limits_that_nobody_stated_are_told(tmp_path, source, told):
-    config = SimpleNamespace(
-        vehicle=Vehicle(), risk=RiskParams(), path=PathParams(), crosscheck=SimpleNamespace(enabled=True)
-    )
+    config = SimpleNamespace(vehicle=Vehicle(), risk=RiskParams(), path=PathParams())
     facts, read, _, _ = written(tmp_path, view(config=config, vehicle_source=source))
     assert [m["kind"] for m in facts["absent"]] == ["vehicle"] * told
     assert ("0.700 m between its axles, 0.600 m between its wheels, up to 20°" in read.text) == told

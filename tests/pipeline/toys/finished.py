@@ -282,11 +282,7 @@ def view(made: dict[str, Bundle] | None = None, *, truth: bool = True, **changes
         bundle=lambda handle: store.get(handle) if isinstance(handle, str) else None,
         tasks=TASKS,
         config=SimpleNamespace(
-            crosscheck=SimpleNamespace(enabled=True),
-            vehicle=Vehicle(name="rover of the toy"),
-            risk=RiskParams(),
-            path=PathParams(),
-            rig=RigParams(),
+            vehicle=Vehicle(name="rover of the toy"), risk=RiskParams(), path=PathParams(), rig=RigParams()
         ),
         config_toml="[locus]\ncell_size = 0.01  # <m>\n",
         seconds=12.3,
