@@ -44,17 +44,13 @@ def classes(scene: Any, idea: str) -> dict[str, Any]:
     """The risk map of a scene without an idea."""
     from hazard.scenes import CELL
 
-    from rille.stages.hazard import classification
     from rille.stages.hazard.risk import RiskParams, risk_map
 
     params = {"closed holes": RiskParams(max_hole=0.0), "added standard deviations": RiskParams(sigmas=0.0)}
-    classification._table.cache_clear()
     with ExitStack() as stack:
         if idea in replacements():
             stack.enter_context(patch.object(*replacements()[idea]))
-        found = risk_map(scene.elevation, scene.elevation_std, CELL, scene.vehicle, params.get(idea))
-    classification._table.cache_clear()
-    return found
+        return risk_map(scene.elevation, scene.elevation_std, CELL, scene.vehicle, params.get(idea))
 
 
 def main() -> None:

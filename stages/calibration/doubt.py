@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
+from rille.stages.geometry.projection import product
 from rille.stages.hfvm.image import thinned
 
 MIN_MATCHES = 100
@@ -71,10 +72,9 @@ def on_their_lines(places: Places, f: NDArray[np.float64] | None) -> float:
     """Share of the matches that lie near their epipolar line; 0 where there are no lines."""
     if f is None:
         return 0.0
-    ones = np.ones((len(places[0]), 1))
-    line = np.hstack([places[0], ones]) @ f.T
-    distance = np.abs(np.sum(line * np.hstack([places[1], ones]), axis=1)) / np.hypot(line[:, 0], line[:, 1])
-    return float(np.mean(distance <= MAX_LINE_DISTANCE_PX))
+    (x, y), (p, q) = (side.T for side in places)
+    a, b, c = product(f, x, y)
+    return float(np.mean(np.abs(a * p + b * q + c) <= MAX_LINE_DISTANCE_PX * np.hypot(a, b)))
 
 
 def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.float64] | None) -> float:

@@ -122,7 +122,7 @@ def adjust(
     *,
     rival: bool,
 ) -> OrientationFit:
-    """Adjust a rig to point pairs, together with the errors that no rig explains.
+    """Adjust a rig to point pairs, together with the errors that no rig explains: Gauss-Newton, weights by the scatter.
 
     Parameters
     ----------
@@ -130,7 +130,22 @@ def adjust(
         (``priors``), so that their part of the residuals does not pass into the free ones.
     rival : see :func:`precision`.
     """
-    return _adjust(rig, pairs, precision(free, priors, rival=rival))
+    prior = precision(free, priors, rival=rival)
+    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
+    for _ in range(30):
+        # All pairs are linearised about the same x. Within a milliradian the derivatives neglect less than .001 pixels.
+        if np.abs(x - linear[0].about)[:RIG].max() > 1e-3:
+            linear = linearised(rig, pairs, x)
+        parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
+        scales = [p.noise for p in parts]
+        normal = np.sum([p.normal for p in parts], axis=0)
+        pull = np.sum([p.pull for p in parts], axis=0)
+        covariance, last = np.linalg.inv(normal + prior), x
+        x = covariance @ pull
+        # Converged: the steps are below a hundredth of the standard deviations.
+        if bool(np.all(np.abs(x - last)[:RIG] < 1e-2 * np.sqrt(np.diag(covariance)[:RIG]))):
+            break
+    return OrientationFit(x, normal, pull, tuple(scales), tuple(p.weights for p in parts))
 
 
 def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors) -> OrientationFit:
@@ -141,7 +156,7 @@ def settle(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: 
     """
     # 1e-7: standard deviation [rad] that holds a parameter; 3e-3 [px]: one that practically holds the smooth error.
     none = replace(priors, rotation=1e-7, baseline=1e-7, systematic=3e-3)
-    return _adjust(rig, pairs, precision(free, none, rival=False))
+    return adjust(rig, pairs, free, none, rival=False)
 
 
 def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Priors, held: Floats) -> Floats:
@@ -162,25 +177,6 @@ def consider_covariance(fit: OrientationFit, free: Sequence[bool], priors: Prior
     covariance = np.zeros((SIZE, SIZE))
     covariance[np.ix_(solved, solved)] = inverse + gain @ np.diag(1.0 / np.diag(prior)[~solved]) @ gain.T
     return np.asarray(covariance[:RIG, :RIG], dtype=np.float64)
-
-
-def _adjust(rig: Rig, pairs: Sequence[PointPairs], prior: Floats) -> OrientationFit:
-    """Gauss-Newton with weights from the scatter; ``prior`` matrix (SIZE, SIZE)."""
-    x, scales, linear = np.zeros(SIZE), [np.inf] * len(pairs), linearised(rig, pairs)
-    for _ in range(30):
-        # All pairs are linearised about the same x. Within a milliradian the derivatives neglect less than .001 pixels.
-        if np.abs(x - linear[0].about)[:RIG].max() > 1e-3:
-            linear = linearised(rig, pairs, x)
-        parts = [_pair(one, scale, x) for one, scale in zip(linear, scales, strict=True)]
-        scales = [p.noise for p in parts]
-        normal = np.sum([p.normal for p in parts], axis=0)
-        pull = np.sum([p.pull for p in parts], axis=0)
-        covariance, last = np.linalg.inv(normal + prior), x
-        x = covariance @ pull
-        # Converged: the steps are below a hundredth of the standard deviations.
-        if bool(np.all(np.abs(x - last)[:RIG] < 1e-2 * np.sqrt(np.diag(covariance)[:RIG]))):
-            break
-    return OrientationFit(x, normal, pull, tuple(scales), tuple(p.weights for p in parts))
 
 
 def precision(free: Sequence[bool], priors: Priors, *, rival: bool) -> Floats:

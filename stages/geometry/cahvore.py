@@ -6,11 +6,11 @@ and row p''.V / p''.A, pixel centres at integers (CAHV: p'' = p). With w = p.O a
 across it:
 
 * CAHVOR bends the ray: p'' = p + mu l, mu = R0 + R1 x^2 + R2 x^4, x = |l| / w.
-* CAHVORE also moves the entrance pupil along O by (t / sin t - 1) e(t), e = E0 + E1 t^2 + E2 t^4, for a ray at the
-  angle t to O, so that w sin t - |l| cos t = (t - sin t) e(t). Then p'' = |l| / x O + (1 + mu) l with
-  x = tan(L t) / L, sin(L t) / L or t for a linearity L above, below or equal to 0 (perspective lens 1, fisheye 0).
+* CAHVORE has, for a ray at the angle t to O, p'' = |l| / x O + (1 + mu) l with x = tan(L t) / L, sin(L t) / L or t for
+  a linearity L above, below or equal to 0 (perspective lens 1, fisheye 0).
 
-CAHVOR is CAHVORE with E = 0 and L = 1. The pixel of a point much farther than E depends only on its direction from C.
+CAHVOR is CAHVORE with L = 1. CAHVORE's entrance pupil also moves along O, by some times E (millimetres). The pixel of a
+point much farther than E depends only on its direction from C, so that E is left out here.
 
 Sources: Yakimovsky, Cunningham (1978), doi:10.1016/0146-664X(78)90112-0; Gennery (2001), Least-squares camera
 calibration including lens distortion and automatic editing of calibration points; Gennery (2006), Generalized camera
@@ -20,7 +20,6 @@ calibration including fish-eye lenses, doi:10.1007/s11263-006-5168-1; Di, Li (20
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,11 +31,10 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bending:
-    """Distortion of a lens: optical axis O (unit length), radial terms R, entrance pupil E (m), linearity L."""
+    """Distortion of a lens: optical axis O (unit length), radial terms R, linearity L."""
 
     axis: Vector
     radial: Vector = (0.0, 0.0, 0.0)
-    pupil: Vector = (0.0, 0.0, 0.0)
     linearity: float = 1.0
 
     def bend(self, points: Floats) -> Floats:
@@ -46,25 +44,23 @@ class Bending:
         across = points - along[:, None] * o
         far = np.linalg.norm(across, axis=1)
         with np.errstate(all="ignore"):
-            chi = self._chi(self._angle(along, far))
+            chi = self._chi(np.arctan2(far, along))
             # On the axis the direction across would be 0 / 0.
             central = far <= 1e-12 * np.abs(along)  # no direction across: the point itself
             scaled = np.where(central, along, far / np.where(central, 1.0, chi))
             factor = 1.0 + _even(self.radial, np.where(central, 0.0, chi))
         return np.asarray(scaled[:, None] * o + factor[:, None] * across)
 
-    def straighten(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Inverse of :meth:`bend`: origins (n, 3) relative to C, m, and unit rays (n, 3); NaN where there is none."""
+    def straighten(self, directions: Floats) -> Floats:
+        """Inverse of :meth:`bend`: unit rays (n, 3); NaN where there is none."""
         o = np.asarray(self.axis)
         along = directions @ o
         across = directions - along[:, None] * o
         far = np.linalg.norm(across, axis=1)
         with np.errstate(all="ignore"):
             angle = self._angle_of(self._unbent(np.where(along > 0, far / along, np.nan)))
-            sine = np.sin(angle)
             unit = np.where(far[:, None] > 0, across / far[:, None], 0.0)
-            moved = np.where(angle > 0, (angle / sine - 1.0) * _even(self.pupil, angle), 0.0)
-        return moved[:, None] * o, np.cos(angle)[:, None] * o + sine[:, None] * unit
+        return np.asarray(np.cos(angle)[:, None] * o + np.sin(angle)[:, None] * unit)
 
     def reach(self) -> float:
         """Angle to O, radians, up to which pixels move outwards."""
@@ -78,21 +74,6 @@ class Bending:
             return limit
         angle = float(self._angle_of(np.array([math.sqrt(float(real.min()))]))[0])
         return limit if math.isnan(angle) else min(angle, limit)
-
-    def _angle(self, along: Floats, far: Floats) -> Floats:
-        """Angle t between O and the ray through a point, by Newton's method."""
-        angle = np.arctan2(far, along)
-        if not any(self.pupil):
-            return angle
-        _, e1, e2 = self.pupil
-
-        def step(angle: Floats) -> Floats:
-            sine, cosine, shift = np.sin(angle), np.cos(angle), _even(self.pupil, angle)
-            slope = 2.0 * e1 * angle + 4.0 * e2 * angle**3
-            miss = along * sine - far * cosine - (angle - sine) * shift
-            return np.asarray(miss / (along * cosine + far * sine - (1.0 - cosine) * shift - (angle - sine) * slope))
-
-        return _newton(step, angle)
 
     def _chi(self, angle: Floats) -> Floats:
         t = np.where(angle < self.reach(), angle, np.nan)
@@ -113,26 +94,17 @@ class Bending:
             return bent
         r0, r1, r2 = self.radial
 
-        def step(chi: Floats) -> Floats:
+        chi = bent / (1.0 + r0)
+        # Each step doubles the right digits of a start that is good to some percent.
+        for _ in range(30):
             square = chi * chi
-            slope = 1 + r0 + 3 * r1 * square + 5 * r2 * square**2
-            return np.asarray(((1.0 + _even(self.radial, chi)) * chi - bent) / slope)
-
-        chi = _newton(step, bent / (1.0 + r0))
+            off = ((1.0 + _even(self.radial, chi)) * chi - bent) / (1 + r0 + 3 * r1 * square + 5 * r2 * square**2)
+            chi = chi - off
+            # Absolute below a radius of 1, relative above.
+            if not (np.abs(off) > 1e-14 * np.maximum(1.0, np.abs(chi))).any():
+                break
         solved = np.abs((1.0 + _even(self.radial, chi)) * chi - bent) < 1e-12 * np.maximum(1.0, bent)
         return np.where(solved & (chi >= 0), chi, np.nan)
-
-
-def _newton(step: Callable[[Floats], Floats], start: Floats) -> Floats:
-    """The zero by Newton's ``step``, which doubles the right digits of a start that is good to some percent."""
-    x = start
-    for _ in range(30):
-        off = step(x)
-        x = x - off
-        # Absolute below 1 radian or radius, relative above.
-        if not (np.abs(off) > 1e-14 * np.maximum(1.0, np.abs(x))).any():
-            break
-    return x
 
 
 def _even(terms: Vector, x: Floats) -> Floats:

@@ -16,11 +16,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
-from rille.stages.geometry.projection import product
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in their order in vectors."""
@@ -73,27 +71,15 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
     to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]
-    distance, slopes = np.empty(len(left)), np.empty((len(left), 7))
-    _distances(to_line @ upright @ to_ray, np.array(to_slopes), left, right, distance, slopes)
-    return distance, slopes
-
-
-@njit(cache=True, nogil=True)
-def _distances(to_line, to_slopes, left, right, distance, slopes):  # type: ignore[no-untyped-def]
-    """Distances (n,) from the lines ``to_line @ p`` of left pixels p, and their derivatives (n, 7)."""
-    for n in range(len(left)):
-        x, y, u, v = left[n, 0], left[n, 1], right[n, 0], right[n, 1]
-        line = product(to_line, x, y)
-        length = np.sqrt(line[0] ** 2 + line[1] ** 2)
-        # The normal of a line points down the image, or to the right if the line is steep.
-        if (line[0] if abs(line[0]) > abs(line[1]) else line[1]) < 0:
-            length = -length
-        d = (u * line[0] + v * line[1] + line[2]) / length
-        distance[n], slopes[n, 5], slopes[n, 6] = d, line[0] / length, line[1] / length
-        for p in range(5):
-            a, b, c = product(to_slopes[p], x, y)
-            # Quotient rule: the length of the line's normal changes too.
-            slopes[n, p] = (u * a + v * b + c) / length - (line[0] * a + line[1] * b) * d / length**2
+    p, q = (np.column_stack([points, np.ones(len(points))]) for points in (left, right))
+    line, *turned = (p @ matrix.T for matrix in (to_line @ upright @ to_ray, *to_slopes))
+    # The normal of a line points down the image, or to the right if the line is steep.
+    down = np.where(np.abs(line[:, 0]) > np.abs(line[:, 1]), line[:, 0], line[:, 1])
+    length = np.copysign(np.hypot(line[:, 0], line[:, 1]), down)[:, None]
+    normal, distance = line[:, :2] / length, (q * line).sum(axis=1) / length[:, 0]
+    # Quotient rule: the length of the line's normal changes too.
+    slopes = [((q * t).sum(axis=1) - (normal * t[:, :2]).sum(axis=1) * distance) / length[:, 0] for t in turned]
+    return distance, np.column_stack([*slopes, normal])
 
 
 def inverse_depth(rig: Rig, pixels: Floats, disparity: Floats) -> tuple[Floats, Floats]:

@@ -155,7 +155,7 @@ class Lens:
         if self.model == "cahvore":
             bent = self.camera.rays(raw)
             bent[:, 1] -= self.coefficients[0] / self.camera.fy * bent[:, 0]
-            return ideal.project(self._bending.straighten(bent)[1])
+            return ideal.project(self._bending.straighten(bent))
         rays = np.column_stack([self._start(raw), np.ones(len(raw))])
         with np.errstate(all="ignore"):
             todo = np.arange(len(raw))

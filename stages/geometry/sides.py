@@ -20,10 +20,9 @@ class BeyondInfinityError(DegenerateError):
     """Most matches lie beyond infinity, though the sides are not exchanged."""
 
 
-def fits(rig: Rig, left: Floats, right: Floats, tolerance: float = MAX_LINE_DISTANCE_PX) -> float:
-    """Share of the matches (n, 2), (n, 2) in front of the cameras and within ``tolerance``, pixels of the coarser
-    image, of their epipolar lines."""
-    tolerance *= right_pixels(rig)
+def fits(rig: Rig, left: Floats, right: Floats) -> float:
+    """Share of the matches (n, 2), (n, 2) in front of the cameras and on their epipolar lines."""
+    tolerance = MAX_LINE_DISTANCE_PX * right_pixels(rig)
     off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
     with np.errstate(divide="ignore", invalid="ignore"):
         ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance

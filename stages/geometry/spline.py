@@ -19,39 +19,18 @@ TAPS_RADIUS_PX = 10
 """Pixels to either side that a coefficient depends on; the cut changes about a thousandth of a grey level."""
 
 POLE = math.sqrt(3.0) - 2.0
-TAPS = np.float32(math.sqrt(3.0) * POLE ** np.arange(TAPS_RADIUS_PX + 1))
-"""The inverse of the filter 1/6, 4/6, 1/6, from the middle to one side."""
+TAPS = np.float32(math.sqrt(3.0) * POLE ** np.abs(np.arange(-TAPS_RADIUS_PX, TAPS_RADIUS_PX + 1)))
+"""The inverse of the filter 1/6, 4/6, 1/6."""
 
 
 def coefficients(image: ArrayLike) -> Floats32:
     """Coefficients (row, col) float32 of the cubic spline through the pixels of an image (row, col).
 
-    The image is mirrored at its borders. Coefficients of a window equal the image's to the bit, :data:`TAPS_RADIUS_PX`
-    pixels or more from the cut.
+    The image is mirrored at its borders. Coefficients of a window equal the image's, :data:`TAPS_RADIUS_PX` pixels or
+    more from the cut.
     """
     grey = np.asarray(image, np.float32)
-    mirrored = cv2.copyMakeBorder(grey, *4 * (TAPS_RADIUS_PX,), cv2.BORDER_REFLECT_101)
-    along = np.empty((mirrored.shape[0], grey.shape[1]), np.float32)
-    out = np.empty(grey.shape, np.float32)
-    _filter(mirrored, TAPS_RADIUS_PX, 1, TAPS, along)
-    _filter(along, TAPS_RADIUS_PX * grey.shape[1], grey.shape[1], TAPS, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _filter(image, first, step, taps, out):  # type: ignore[no-untyped-def]
-    """``out`` (row, col) from an ``image`` with :data:`TAPS_RADIUS_PX` pixels more to both sides, ``step`` pixels apart
-    in reading order; ``first``: where the first pixel of ``out`` stands in it."""
-    flat, width, cols = image.reshape(-1), image.shape[1], out.shape[1]
-    for y in range(out.shape[0]):
-        at, total = first + y * width, out[y]
-        middle = flat[at : at + cols]
-        for x in range(cols):
-            total[x] = taps[0] * middle[x]
-        for k in range(1, TAPS_RADIUS_PX + 1):
-            before, behind = flat[at - k * step : at - k * step + cols], flat[at + k * step : at + k * step + cols]
-            for x in range(cols):
-                total[x] += taps[k] * (before[x] + behind[x])
+    return np.asarray(cv2.sepFilter2D(grey, cv2.CV_32F, TAPS, TAPS, borderType=cv2.BORDER_REFLECT_101))
 
 
 @njit(cache=True, nogil=True)

@@ -17,12 +17,11 @@ cells is compared with its limit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -42,11 +41,8 @@ HIDDEN_STEPS = 0.5
 """Standard deviation that entirely unknown ground in the wheel's window, or below the vehicle, adds to a measure, in
 units of ``max_step``."""
 
-STEPS_PER_EXCESS = 64
-"""Steps of the table of F for one unit of excess."""
-
 MAX_EXCESS = 16.0
-"""Excess where the table of F ends."""
+"""Excess from which on F is 1, and below whose negative it is 0: the tails of Student's t are left out."""
 
 LIFT = 0.8
 """Added to t near and above the limit: a measure at its limit is more often above it than below, since a matcher
@@ -177,19 +173,9 @@ def _band(m: Measure, values: Floats32, most: float) -> Floats32:
 
 
 def _chance(excess: Floats32) -> Floats32:
-    """F of the greatest excess (row, col)."""
-    steps = np.floor(np.clip(excess, -MAX_EXCESS, MAX_EXCESS) * STEPS_PER_EXCESS) + MAX_EXCESS * STEPS_PER_EXCESS
-    return _table()[steps.astype(np.intp)]
-
-
-@cache
-def _table() -> Floats32:
-    """F (entry,) at steps of the excess."""
-    t = np.arange(-MAX_EXCESS * STEPS_PER_EXCESS, MAX_EXCESS * STEPS_PER_EXCESS + 1) / STEPS_PER_EXCESS
+    """F of the greatest excess (row, col): Student's t of three degrees of freedom in closed form."""
     # The lift begins at an excess of -0.4 and is full 0.6 above.
-    raised = np.clip((t + 0.4) / 0.6, 0.0, 1.0)
-    # Three degrees of freedom.
-    chance = scipy.special.stdtr(3.0, t + LIFT * raised)
-    # Beyond the table 0 and 1, without the tails of Student's t.
-    chance[0], chance[-1] = 0.0, 1.0
-    return np.asarray(chance, dtype=np.float32)
+    lift = np.float32(LIFT) * np.clip((excess + np.float32(0.4)) / np.float32(0.6), 0, 1)
+    t = (excess + lift) / np.float32(math.sqrt(3.0))
+    chance = 0.5 + (np.arctan(t) + t / (1 + t * t)) / np.float32(math.pi)
+    return np.where(np.abs(excess) < MAX_EXCESS, chance, excess > 0).astype(np.float32)

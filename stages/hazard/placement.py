@@ -186,26 +186,18 @@ def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
     left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
     for c in range(out.shape[0]):
         fl, fr, rl, rr = wheels[0][c], wheels[1][c], wheels[2][c], wheels[3][c]
-        u, v = abs(fl - rl) * left, abs(fr - rr) * right
-        # NaN compares false: a plane with a wheel over unknown ground is left out.
-        along = u if u > zero else zero
-        along = v if v > along else along
-        u, v = abs(fl - fr) * front, abs(rl - rr) * rear
-        across = u if u > zero else zero
-        across = v if v > across else across
-        square = along * along + across * across
-        out[c] = square if square > out[c] else out[c]
+        # NaN compares false and is no maximum: a plane with a wheel over unknown ground is left out.
+        along = max(zero, abs(fl - rl) * left, abs(fr - rr) * right)
+        across = max(zero, abs(fl - fr) * front, abs(rl - rr) * rear)
+        out[c] = max(out[c], along * along + across * across)
 
 
 @njit(cache=True, nogil=True)
 def _rise(wheels, belly, weights, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the rise of a point of the belly, with these weights of the wheels, over the wheels' plane."""
-    w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
-    zero = np.float32(0.0)
+    (fl, fr, rl, rr), zero = wheels, np.float32(0.0)
     for c in range(out.shape[0]):
-        fl, fr = belly[c] - wheels[0][c], belly[c] - wheels[1][c]
-        rl, rr = belly[c] - wheels[2][c], belly[c] - wheels[3][c]
         # Each difference is cut off at 0 before it is weighted, so that none compensates another.
-        total = w0 * (fl if fl > zero else zero) + w1 * (fr if fr > zero else zero)
-        total += w2 * (rl if rl > zero else zero) + w3 * (rr if rr > zero else zero)
-        out[c] = total if total > out[c] else out[c]
+        front = weights[0] * max(zero, belly[c] - fl[c]) + weights[1] * max(zero, belly[c] - fr[c])
+        rear = weights[2] * max(zero, belly[c] - rl[c]) + weights[3] * max(zero, belly[c] - rr[c])
+        out[c] = max(out[c], front + rear)

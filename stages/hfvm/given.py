@@ -14,7 +14,6 @@ judged half; without this part 60 and 86, 56 and 82. 2026-11-26."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -68,10 +67,9 @@ def check(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams) -
     # Displacements of a level are 16-bit and doubled from level to level. NaN is not less, and so unknown as well.
     known = np.abs(column) < 16000
     u = np.where(known, column, 0.0).astype(np.float32)
-    zeros = np.zeros_like(u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
     a, b = as_matched(left, params), as_matched(right, params)
-    inside = lands(np.rint(u), zeros, known, right.valid[0])
+    inside = lands(there, known, right.valid[0])
     ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
         b = levelled(b, ratio)
@@ -94,25 +92,15 @@ def _way_back(images: PyramidPair, column: AnyArray) -> Map:
     """Displacements of the right image, matched at the finest level near the given ones (row, col), NaN unknown."""
     above = None
     if images.levels > 1:
-        left, right = (image.layers[1] for image in (images.left, images.right))
-        u, known = _halved(column, left.shape)
+        right = images.right.layers[1]
+        # One of the pixels below each: of a block across a depth edge the mean would lie on neither surface.
+        column = column[::2, ::2]
+        known = np.isfinite(column)
+        u = np.rint(np.where(known, column, 0.0) / 2).astype(np.int16)
         back, hit = _reverse(u, known, right.shape)
         maps = Map(back, np.zeros_like(back)), Map(u, np.zeros_like(u))
         above = State(1, *maps, hit & (right.valid != 0), known, FREE_BAND, -NEAR_SIGN)
     return one_way(images.reverse(), 0, above, -NEAR_SIGN, images.recipe.rounds[1])
-
-
-def _halved(column: AnyArray, shape: Shape) -> tuple[AnyArray, NDArray[np.bool_]]:
-    """Column displacements of level 1, of ``shape``: medians of the known ones of each block, whole pixels (int16)."""
-    padded = np.full((2 * shape[0], 2 * shape[1]), np.nan, np.float32)
-    padded[: column.shape[0], : column.shape[1]] = column
-    blocks = padded.reshape(shape[0], 2, shape[1], 2).swapaxes(1, 2).reshape(*shape, 4)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # blocks without any are NaN, as they should be
-        # No means: of a block across a depth edge they lie on neither surface.
-        u = np.nanmedian(blocks, axis=2) / 2
-    known = np.isfinite(u)
-    return np.rint(np.where(known, u, 0.0)).astype(np.int16), known
 
 
 def _reverse(

@@ -23,7 +23,8 @@ warped gradient, both of the cubic spline through the pixels, which keeps detail
 falling with r and s with the second difference, so that neither a wrong pixel nor an edge pulls its neighbours.
 Stiffness begins weak and tolerant of bends: at full strength it would keep the errors of windows beside edges as
 relief. The lines are fitted to the matches themselves (:mod:`rille.stages.hfvm.epipolar`); k is reduced where matches
-do not lie on lines. Solved by a fixed number of Gauss-Seidel sweeps in reading order.
+do not lie on lines. Solved by a fixed number of sweeps (:mod:`rille.stages.numeric.relaxation`), in turn for the way
+along the lines and for that off them.
 
 **Standard deviations** of the column disparities, or of the rows' where epipolar lines run along the columns, are
 computed from figures of each pixel.
@@ -59,7 +60,7 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.spline import value_and_gradient
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import thinned
-from rille.stages.numeric.relaxation import OVERRELAXATION
+from rille.stages.numeric.relaxation import bend_weights, relax
 from rille.stages.numeric.windows import window_count, window_room, window_sum, window_sum32
 
 Maps = tuple[AnyArray, AnyArray]
@@ -105,29 +106,13 @@ def refine(
     """
     now, rests, axes = start, list[AnyArray](), _axes(to_right, start)
     for _ in range(steps):
-        planes = np.empty((4, *keep.shape), np.float32)
-        _window_steps(images, to_right(*now), axes, keep, planes, upright)
-        step_u, step_v, rest, per_noise = planes
+        step_u, step_v, rest, per_noise = _window_steps(_warped(images, *to_right(*now), keep), axes, keep, upright)
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
-    _take_back(start, rests[0], now, rests[-1])
-    return Refined(*now, rests[-1], per_noise)
-
-
-@njit(cache=True, nogil=True)
-def _take_back(start, first, new, last):  # type: ignore[no-untyped-def]
-    """Restore displacements and residuals where the steps led too far, or to a worse fit.
-
-    Residuals are those before a step: after a single one ``last`` is ``first``, and the distance alone counts.
-    """
-    (u, v), (new_u, new_v), farthest = start, new, np.float32(MAX_CORRECTION_PX**2)
-    for y in range(u.shape[0]):
-        for x in range(u.shape[1]):
-            du, dv = new_u[y, x] - u[y, x], new_v[y, x] - v[y, x]
-            better = (last[y, x] <= first[y, x]) & (du * du + dv * dv <= farthest)
-            new_u[y, x] = new_u[y, x] if better else u[y, x]
-            new_v[y, x] = new_v[y, x] if better else v[y, x]
-            last[y, x] = last[y, x] if better else first[y, x]
+    # Residuals are those before a step: after a single one the last are the first, and the distance alone counts.
+    better = (rests[-1] <= rests[0]) & (np.hypot(now[0] - start[0], now[1] - start[1]) <= MAX_CORRECTION_PX)
+    u, v, rest = (np.where(better, new, old) for new, old in zip((*now, rests[-1]), (*start, rests[0]), strict=True))
+    return Refined(u, v, rest, per_noise)
 
 
 @njit(cache=True, nogil=True)
@@ -166,107 +151,64 @@ def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     return out_u, out_v
 
 
-def _axes(to_right: Frame, now: Maps) -> AnyArray:
+def _axes(to_right: Frame, now: Maps) -> AnyArray | None:
     """Where a column and a row of the frame of steps lead in the right image, which may be turned and scaled against
-    it: planes (4, row, col) float32, (4, 0, 0) where both frames are one."""
+    it: planes (4, row, col) float32, 0 beyond its horizon; None where both frames are one."""
     there = to_right(*now)
     if there[0] is now[0]:
-        return np.empty((4, 0, 0), np.float32)
+        return None
     ends = *to_right(now[0] + 1, now[1]), *to_right(now[0], now[1] + 1)
-    return np.stack([end - begin for end, begin in zip(ends, 2 * there, strict=True)])
+    return np.asarray(np.nan_to_num([end - begin for end, begin in zip(ends, 2 * there, strict=True)]))
 
 
-@njit(cache=True, nogil=True)
-def _window_steps(images, now, axes, keep, out, upright):  # type: ignore[no-untyped-def]
-    """Steps of all windows; each is summed afresh, so that nothing adds up. Reach: the window's radius.
+def _window_steps(planes: AnyArray, axes: AnyArray | None, keep: AnyArray, upright: bool) -> tuple[AnyArray, ...]:
+    """Steps of all windows, from :func:`_warped`: columns and rows (row, col), zero where there is no step; residual
+    variance before the step, infinite where there is none; and the variance of the column, or the row, for a unit of
+    variance of the grey levels."""
+    known, gx, gy, rest = planes
+    if axes is not None:
+        gx, gy = gx * axes[0] + gy * axes[1], gx * axes[2] + gy * axes[3]
+    side, nil = 2 * WINDOW_RADIUS_PX + 1, np.float32(0)
+    count, *sums = (window_sum32(plane, side) for plane in (known, gx, gy, rest))
+    n, use = np.maximum(count, np.float32(1)), keep & (count >= 0.5 * side**2)
+    parts = [(plane, total / n) for plane, total in zip((gx, gy, rest), sums, strict=True)]
 
-    ``out``: planes (4, row, col): columns and rows, zero where there is no step; residual variance before the step,
-    infinite where there is none; and the variance of the column, or the row, for a unit of variance of the grey levels.
-    """
-    (rows, cols), radius, size = keep.shape, WINDOW_RADIUS_PX, 2 * WINDOW_RADIUS_PX + 1
-    fresh, total = np.zeros((10, cols + 2 * radius), np.float32), np.empty((10, cols), np.float32)
-    ring = np.zeros((size, 10, cols), np.float32)
-    # From above the image on: the ring must hold all rows of the first window before that is solved.
-    for y in range(-radius, rows):
-        row = ring[(y + radius) % size]
-        _products(images, now, axes, keep, y + radius, fresh[:, radius : radius + cols])
-        for k in range(10):
-            part, line = fresh[k], row[k]
-            for x in range(cols):
-                line[x] = (part[x] + (part[x + 1] + part[x + 2])) + (part[x + 3] + part[x + 4])
-        if y >= 0:
-            for k in range(10):
-                a, b, c, d, e, line = ring[0, k], ring[1, k], ring[2, k], ring[3, k], ring[4, k], total[k]
-                for x in range(cols):
-                    line[x] = (a[x] + (b[x] + c[x])) + (d[x] + e[x])
-            _solve_windows(total, keep[y], out[:, y], upright)
+    def moment(i: int, j: int) -> AnyArray:
+        """Sum of products of the gradient or the difference, less their means over the window."""
+        (a, mean_a), (b, mean_b) = parts[i], parts[j]
+        return window_sum32(a * b, side) - mean_a * mean_b * n
 
-
-@njit(cache=True, nogil=True)
-def _products(images, now, axes, keep, y, out):  # type: ignore[no-untyped-def]
-    """Row ``y`` of the planes (10, col) that are summed: count, gx, gy, r, gx gx, gx gy, gy gy, gx r, gy r, r r; zero
-    where a pixel takes no part."""
-    out[:] = np.float32(0.0)
-    if y < len(keep):
-        warp_row(images, now[0], now[1], keep, y, out)
-        count, gx, gy, rest = out[0], out[1], out[2], out[3]
-        if axes.size:
-            for x in range(gx.size):
-                if count[x] > 0:
-                    along = gx[x] * axes[0, y, x] + gy[x] * axes[1, y, x]
-                    gx[x], gy[x] = along, gx[x] * axes[2, y, x] + gy[x] * axes[3, y, x]
-        for k, (p, q) in enumerate(((gx, gx), (gx, gy), (gy, gy), (gx, rest), (gy, rest), (rest, rest))):
-            product = out[4 + k]
-            for x in range(gx.size):
-                product[x] = p[x] * q[x]
-
-
-@njit(cache=True, nogil=True)
-def _solve_windows(sums, keep, out, upright):  # type: ignore[no-untyped-def]
-    """Steps of a row from the sums (10, col) over each pixel's window."""
-    # Assumed noise, 8 squared grey levels a pixel, shortens steps where texture is weak.
-    noise, least = np.float32(8.0), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
-    one, nil, far = np.float32(1.0), np.float32(0.0), np.float32(np.inf)
-    for x in range(keep.size):
-        n = max(sums[0, x], one)
-        use = keep[x] & (n >= least)
-        sum_gx, sum_gy, sum_r = sums[1, x], sums[2, x], sums[3, x]
-        # Noise on the diagonal shortens steps where texture is weak, and keeps the determinant positive.
-        a = sums[4, x] - sum_gx * sum_gx / n + noise * n
-        b = sums[5, x] - sum_gx * sum_gy / n
-        c = sums[6, x] - sum_gy * sum_gy / n + noise * n
-        p, q = sums[7, x] - sum_gx * sum_r / n, sums[8, x] - sum_gy * sum_r / n
-        det = a * c - b * b
-        # A pixel at most: beyond it the step is a guess.
-        out[0, x] = min(max((c * p - b * q) / det, -one), one) if use else nil
-        out[1, x] = min(max((a * q - b * p) / det, -one), one) if use else nil
-        # Rounding may leave the residual of a perfect fit below zero.
-        out[2, x] = max(sums[9, x] - sum_r * sum_r / n, nil) / n if use else far
-        out[3, x] = (a if upright else c) / det if use else nil
+    # Assumed noise, 8 squared grey levels a pixel, on the diagonal shortens steps where texture is weak, and keeps the
+    # determinant positive.
+    a, b, c = moment(0, 0) + np.float32(8) * n, moment(0, 1), moment(1, 1) + np.float32(8) * n
+    p, q, det = moment(0, 2), moment(1, 2), a * c - b * b
+    # A pixel at most: beyond it the step is a guess.
+    step_u, step_v = (np.where(use, np.clip(d / det, -1, 1), nil) for d in (c * p - b * q, a * q - b * p))
+    # Rounding may leave the residual of a perfect fit below zero.
+    left = np.where(use, np.maximum(moment(2, 2), nil) / n, np.float32(np.inf))
+    return step_u, step_v, left, np.where(use, (a if upright else c) / det, nil)
 
 
 def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
     """Planes (4, row, col), zero where a pixel takes no part: 1, gradient (x, y) of the right image, left minus it."""
     planes = np.zeros((4, *u.shape), np.float32)
-    for y in range(len(u)):
-        warp_row(images, u, v, keep, y, planes[:, y])
+    _warp(images, u, v, keep, planes)
     return planes
 
 
 @njit(cache=True, nogil=True)
-def warp_row(images, u, v, keep, y, out):  # type: ignore[no-untyped-def]
-    """Row ``y`` of :func:`_warped`; ``out`` (4, col) comes as zeros."""
+def _warp(images, u, v, keep, out):  # type: ignore[no-untyped-def]
     spline, half = images.spline, np.float32(0.5)
     last_x, last_y = spline.shape[1] - 2, spline.shape[0] - 2
-    for x in range(u.shape[1]):
-        xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
-        if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
-            continue
-        # Unsigned indices need no check for counting from the end.
-        if not images.valid[np.uint64(yr + half), np.uint64(xr + half)]:
-            continue
-        value, gx, gy = value_and_gradient(spline, xr, yr)
-        out[0, x], out[1, x], out[2, x], out[3, x] = 1, gx, gy, images.left[y, x] - value
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (keep[y, x] and xr >= 1 and xr < last_x and yr >= 1 and yr < last_y):
+                continue
+            # Unsigned indices need no check for counting from the end.
+            if images.valid[np.uint64(yr + half), np.uint64(xr + half)]:
+                value, gx, gy = value_and_gradient(spline, xr, yr)
+                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x] = 1, gx, gy, images.left[y, x] - value
 
 
 def surroundings(rest: AnyArray, deviations: Maps, keep: AnyArray, noise: tuple[float, float]) -> Maps:
@@ -279,39 +221,24 @@ def surroundings(rest: AnyArray, deviations: Maps, keep: AnyArray, noise: tuple[
     b^2 and the difference, if that raises the correlation and the left image shows more than noise.
     """
     known = keep & (rest < np.inf)
-    nil = np.float32(0.0)
-    planes = (*(np.where(known, a, nil) for a in (rest, *(d * d for d in deviations))), known.astype(np.float32))
+    planes = (np.where(known, a, np.float32(0)) for a in (rest, *(d * d for d in deviations), np.ones_like(rest)))
     # Fewer pixels do not tell correlated noise from texture.
-    sums = tuple(window_sum32(plane, 9) for plane in planes)
-    correlation, around = np.empty_like(rest), np.empty_like(rest)
-    _correlation(sums, (np.float32(noise[0]), np.float32(noise[1])), correlation, around)
-    return correlation, around
+    differ, a, b, count = (window_sum32(plane, 9) for plane in planes)
+    correlation = _alike(differ, a, b)
+    if any(noise):
+        rest = np.maximum(differ - np.float32(sum(noise)) * count, np.float32(0))
+        without = _alike(rest, a - np.float32(noise[0]) * count, b - np.float32(noise[1]) * count)
+        # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
+        # noise alone, of which denoising leaves about .3.
+        shown = a > np.float32(0.4**2 * noise[0]) * count
+        correlation = np.where(shown, np.maximum(correlation, without), correlation)
+    return np.where(a > 0, correlation, np.float32(1)), differ / np.maximum(count, np.float32(1))
 
 
-@njit(cache=True, nogil=True)
-def _correlation(sums, noise, correlation, around):  # type: ignore[no-untyped-def]
-    nil, one = np.float32(0.0), np.float32(1.0)
-    # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
-    # noise alone, of which denoising leaves about .3.
-    texture = np.float32(0.4 * 0.4)
-    for y in range(correlation.shape[0]):
-        differ, left, right, count = sums[0][y], sums[1][y], sums[2][y], sums[3][y]
-        for x in range(correlation.shape[1]):
-            n, a, b = count[x], left[x], right[x]
-            found = _alike(differ[x], a, b)
-            if a > texture * noise[0] * n:
-                rest = max(differ[x] - (noise[0] + noise[1]) * n, nil)
-                found = max(found, _alike(rest, a - noise[0] * n, b - noise[1] * n))
-            correlation[y, x] = found if a > 0 else one
-            around[y, x] = differ[x] / max(n, one)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _alike(differ, a, b):  # type: ignore[no-untyped-def]
+def _alike(differ: AnyArray, a: AnyArray, b: AnyArray) -> AnyArray:
     """Correlation of signals of the variances ``a, b`` whose difference has the variance ``differ``."""
-    least = np.float32(1e-6)
-    a, b = max(a, least), max(b, least)
-    return (a + b - differ) / (np.float32(2.0) * np.sqrt(a * b))
+    a, b = (np.maximum(variance, np.float32(1e-6)) for variance in (a, b))
+    return np.asarray((a + b - differ) / (np.float32(2.0) * np.sqrt(a * b)))
 
 
 BEND_STIFFNESS = 2000.0
@@ -335,23 +262,30 @@ def fit_relief(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -
     stays there. Only the way along its line counts: a match that was found rows off its line is on the same thing more
     often than not, and the lines know its row.
     """
-    start_u, start_v = u, v
-    u, v = np.where(keep, u, np.float32(0)), np.where(keep, v, np.float32(0))
-    lines, trust = _lines(u, v, keep, images.spline.shape)
+    (a, b, c), trust = _lines(u, v, keep, images.spline.shape)
     # 1000.0 squared grey levels for a pixel off the line: more than the strongest texture says.
-    holds = lines * np.float32(np.sqrt(1000.0 * trust))
+    hold, one = np.float32(1000.0 * trust), np.ones(u.shape, np.float32)
+    along, off = (np.where(keep, d, np.float32(np.nan)) for d in (b * u - a * v, a * u + b * v + c))
+
+    def displaced(along: AnyArray, off: AnyArray) -> Maps:
+        """Displacements by their ways along the lines, and their distances off them."""
+        return b * along + a * (off - c), b * (off - c) - a * along
+
+    start, start_off = along, np.float32(1.0 - trust) * off
     # Four steps instead of seven: the median error of the judged half is .165 px instead of .160.
     for soft in (True, True, False, False):
         stiffness, bend = BEND_STIFFNESS * (0.15 if soft else 1.0), MAX_BEND_PX * (2.0 if soft else 1.0)
-        grey = _grey(images, u, v, keep)
-        stiff = _stiffness(u, v, keep, np.float32(bend), np.float32(stiffness))
-        normal = np.zeros((5, *u.shape), np.float32)
-        _normal(grey, u, v, holds, keep, stiff, normal)
-        u, v = _relax(normal, stiff, u, v)
-    if trust > 0:
-        start_u, start_v = _feet(lines, trust, start_u, start_v, keep)
-    good = keep & (np.hypot(u - start_u, v - start_v) <= MAX_CORRECTION_PX)
-    return np.where(good, u, start_u), np.where(good, v, start_v)
+        weight, gx, gy, rest = _grey(images, *displaced(along, off), keep)
+        bends = bend_weights(along, one, bend, stiffness)
+        # First along the lines, then off them, with what is left of the difference.
+        slope = b * gx - a * gy
+        moved = relax(along, weight * slope**2, weight * slope * rest, bends, keep, sweeps=10)
+        rest, along, slope = rest - slope * np.nan_to_num(moved - along), moved, a * gx + b * gy
+        pull = weight * slope * rest - hold * np.nan_to_num(off)
+        off = relax(off, weight * slope**2 + hold, pull, bends, keep, sweeps=10)
+    good = np.hypot(along - start, off - start_off) <= MAX_CORRECTION_PX
+    best = displaced(np.where(good, along, start), np.where(good, off, start_off))
+    return np.where(keep, best[0], u), np.where(keep, best[1], v)
 
 
 def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
@@ -373,104 +307,22 @@ def _grey(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> Any
 
 
 def _lines(u: AnyArray, v: AnyArray, keep: AnyArray, right_shape: tuple[int, int]) -> tuple[AnyArray, float]:
-    """Epipolar lines (row, col, 3) fitted to the matches, and trust in them, 0..1: 0 if undetermined or bent."""
+    """Epipolar lines (3, row, col) fitted to the matches, and trust in them, 0..1; (3, 1, 1) along the rows, and 0, if
+    they are undetermined or bent."""
     y, x = thinned(keep, 4000)
     fit = epipolar.fit_points(x, y, u[y, x], v[y, x], keep.shape, right_shape)
+    none = np.array([0.0, 1.0, 0.0], np.float32)[:, None, None], 0.0
     if fit is None:
-        return np.zeros((*u.shape, 3), np.float32), 0.0
-    lines = epipolar.lines(fit[0], u.shape)
+        return none
+    lines = np.moveaxis(epipolar.lines(fit[0], u.shape), 2, 0)
     # Clipped, so that a patch of wrong matches does not count as a bend.
-    off = np.clip(lines[..., 0] * u + lines[..., 1] * v + lines[..., 2], -0.5, 0.5)
-    off = np.where(keep, off, np.float32(0))
+    off = np.where(keep, np.clip(lines[0] * u + lines[1] * v + lines[2], -0.5, 0.5), np.float32(0))
     # 65 pixels: side of a neighbourhood; where lenses bend the lines its matches lie off them to one side.
     bent = (window_sum32(off, 65) / np.maximum(window_count(keep, 65), 1))[y, x]
     # 0.05 pixels: median distance from the lines up to which they are trusted fully; beyond it by its inverse square.
     trust = min(1.0, (0.05 / max(fit[1], 1e-9)) ** 2)
     # 0.1 pixels: median of those means up to which the lines are trusted; noise has .02.
-    return lines, trust if epipolar.typical(bent) <= 0.1 else 0.0
-
-
-def _feet(lines: AnyArray, trust: float, u: AnyArray, v: AnyArray, keep: AnyArray) -> Maps:
-    """Displacements with the kept ones moved towards their lines, by the share ``trust`` of the distance."""
-    off = lines[..., 0] * u + lines[..., 1] * v + lines[..., 2]
-    e = np.where(keep, np.float32(trust) * off, np.float32(0))
-    return u - e * lines[..., 0], v - e * lines[..., 1]
-
-
-def _stiffness(u: AnyArray, v: AnyArray, keep: AnyArray, bend: np.float32, stiffness: np.float32) -> AnyArray:
-    """Weights (2, row, col) of the second difference at each pixel along its row and column, 0 where a neighbour is
-    unknown."""
-    planes = np.zeros((2, *u.shape), np.float32)
-    before, here, after = slice(None, -2), slice(1, -1), slice(2, None)
-    for out, a, b, there in ((planes[0], u, v, keep), (planes[1].T, u.T, v.T, keep.T)):
-        d, e = (m[:, before] - m[:, here] + m[:, after] - m[:, here] for m in (a, b))
-        weight = stiffness / (np.float32(1.0) + (d * d + e * e) / (bend * bend))
-        np.copyto(out[:, here], weight, where=there[:, before] & there[:, here] & there[:, after])
-    return planes
-
-
-@njit(cache=True, nogil=True)
-def _normal(grey, u, v, holds, keep, stiff, out):  # type: ignore[no-untyped-def]
-    """Inverted normal equations of each pixel, for the sweeps: (m n; n o) (u, v) = (p, q) + terms of its neighbours.
-
-    ``out`` (5, row, col): o / det, n / det, m / det, p, q; zero where a pixel stays as it is. ``grey``: of
-    :func:`_grey`; ``holds``: lines whose distance is in grey levels.
-    """
-    rows, cols = u.shape
-    four = np.float32(4.0)
-    for y in range(rows):
-        for x in range(cols):
-            if not keep[y, x]:
-                continue
-            w, gx, gy, rest = grey[0, y, x], grey[1, y, x], grey[2, y, x], grey[3, y, x]
-            lx, ly, off = holds[y, x, 0], holds[y, x, 1], holds[y, x, 2]
-            a, b, c = w * gx * gx + lx * lx, w * gx * gy + lx * ly, w * gy * gy + ly * ly
-            # Of the squared distance from the line only its offset is left: the displacement itself cancels.
-            warp = gx * u[y, x] + gy * v[y, x] + rest
-            p, q = w * gx * warp - lx * off, w * gy * warp - ly * off
-            s = four * (stiff[0, y, x] + stiff[1, y, x])
-            s += (stiff[0, y, x - 1] if x > 0 else 0) + (stiff[0, y, x + 1] if x < cols - 1 else 0)
-            s += (stiff[1, y - 1, x] if y > 0 else 0) + (stiff[1, y + 1, x] if y < rows - 1 else 0)
-            m, o = a + s, c + s
-            det = m * o - b * b
-            # Else hardly any texture, line or neighbour holds the pixel, and it stays.
-            if det > np.float32(1.0):
-                out[0, y, x], out[1, y, x], out[2, y, x], out[3, y, x], out[4, y, x] = o / det, b / det, m / det, p, q
-
-
-def _relax(normal: AnyArray, stiff: AnyArray, u: AnyArray, v: AnyArray) -> Maps:
-    """Displacements after ten Gauss-Seidel sweeps; zeros stand for the neighbours of the border."""
-    u, v, across, down = (np.pad(a, 2) for a in (u, v, *stiff))
-    _sweep(normal, across, down, u, v)
-    return np.ascontiguousarray(u[2:-2, 2:-2]), np.ascontiguousarray(v[2:-2, 2:-2])
-
-
-@njit(cache=True, nogil=True)
-def _sweep(normal, across, down, u, v):  # type: ignore[no-untyped-def]
-    """Gauss-Seidel sweeps on ``u, v`` in place; all but ``normal`` have a frame of two pixels.
-
-    A pixel takes part in three second differences of its row and three of its column: as their middle, where it counts
-    twice, and as either end. ``su``, ``sv``: the weighted values that they want.
-    """
-    _, rows, cols = normal.shape
-    two, overshoot = np.float32(2.0), np.float32(OVERRELAXATION)
-    for _ in range(10):
-        for y in range(rows):
-            minor_v, cross, minor_u, p, q = normal[0, y], normal[1, y], normal[2, y], normal[3, y], normal[4, y]
-            k, k_up, k_own, k_down = across[y + 2], down[y + 1, 2:], down[y + 2, 2:], down[y + 3, 2:]
-            uo, u1, u2, u3, u4 = u[y + 2], u[y, 2:], u[y + 1, 2:], u[y + 3, 2:], u[y + 4, 2:]
-            vo, v1, v2, v3, v4 = v[y + 2], v[y, 2:], v[y + 1, 2:], v[y + 3, 2:], v[y + 4, 2:]
-            for x in range(cols):
-                # Zero marks a pixel that stays: elsewhere it is positive.
-                if minor_v[x] == 0:
-                    continue
-                kw, ko, ke, ku, kc, kd = k[x + 1], two * k[x + 2], k[x + 3], k_up[x], two * k_own[x], k_down[x]
-                su = p[x] + (kc * (u2[x] + u3[x]) + ku * (two * u2[x] - u1[x]) + kd * (two * u3[x] - u4[x]))
-                sv = q[x] + (kc * (v2[x] + v3[x]) + ku * (two * v2[x] - v1[x]) + kd * (two * v3[x] - v4[x]))
-                su += ke * (two * uo[x + 3] - uo[x + 4]) + ko * uo[x + 3] - kw * uo[x] + (ko + two * kw) * uo[x + 1]
-                sv += ke * (two * vo[x + 3] - vo[x + 4]) + ko * vo[x + 3] - kw * vo[x] + (ko + two * kw) * vo[x + 1]
-                uo[x + 2] += overshoot * (minor_v[x] * su - cross[x] * sv - uo[x + 2])
-                vo[x + 2] += overshoot * (minor_u[x] * sv - cross[x] * su - vo[x + 2])
+    return (lines, trust) if epipolar.typical(bent) <= 0.1 else none
 
 
 BLANK_STD_PX = 0.2

@@ -79,6 +79,10 @@ class GroundFrameParams(Params):
     sigma_disparity: float = Field(0.2, gt=0)
 
 
+Surface = tuple[list[float], list[float], list[float]]
+"""Plane, relief and footprint, as :class:`~rille.stages.facts.terrain.GroundFacts` has them."""
+
+
 class VerticalHint(NamedTuple):
     """Given sources of the vertical; the first that is not None is used.
 
@@ -133,16 +137,8 @@ def level(
             return _on_ground(stated, R_local_left, samples, rig, source)
     except DegenerateError as error:
         why = error
-    facts: GroundFacts = {
-        "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
-        "source": source,
-        "plane": None,
-        "relief": None,
-        "cell_size": _cell_without_ground(rho[rho > MIN_DEPTH_SIGMAS * samples.sigma], rig),
-        "footprint": None,
-        "ground_share": 0.0,
-        "no_ground": str(why),
-    }
+    facts = _facts(RigidTransform(R_local_left, np.zeros(3)), source, _cell_without_ground(samples, rig))
+    facts["no_ground"] = str(why)
     if other is not None:
         facts["other_up"] = other.up.tolist()
     if known_up is not None:
@@ -210,16 +206,9 @@ def _on_ground(ground: GroundPlane, R_local_left: Floats, samples: Samples, rig:
     footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, cell)
     points = (samples.rays / np.maximum(samples.rho, 1e-12)[:, None]) @ R_local_left.T
     relief = _relief(points[samples.rho > 0], plane, footprint, ground.height)
-    return {
-        "T_local_left": RigidTransform(R_local_left, np.zeros(3)).to_list(),
-        "source": source,
-        "plane": plane,
-        "relief": relief,
-        "cell_size": cell,
-        "footprint": footprint,
-        "ground_share": ground.inliers,
-        "ground_reach": ground.reach,
-    }
+    facts = _facts(RigidTransform(R_local_left, np.zeros(3)), source, cell, (plane, relief, footprint))
+    facts["ground_share"], facts["ground_reach"] = ground.inliers, ground.reach
+    return facts
 
 
 def scene_plane(samples: Samples) -> GroundPlane:
@@ -273,20 +262,28 @@ def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:
     max_sigma = float(f"{10.0 * np.median(samples.sigma_px / view.slope):.2g}")
     footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, max_sigma)
     relief = _spread(view.xyz, [0.0, 0.0, 0.0], footprint, RELIEF_MARGIN_SHARE * reference.height)
+    facts = _facts(T_local_left, REFERENCE_PLANE, cell, ([0.0, 0.0, 0.0], relief, footprint))
+    facts["max_sigma"], facts["ground_share"] = max_sigma, reference.inliers
+    return facts
+
+
+def _facts(T_local_left: RigidTransform, source: str, cell: float, surface: Surface | None = None) -> GroundFacts:
+    """Facts of a pair on its reference plane; without one: where no ground is seen."""
+    plane, relief, footprint = surface or (None, None, None)
     return {
         "T_local_left": T_local_left.to_list(),
-        "source": REFERENCE_PLANE,
-        "plane": [0.0, 0.0, 0.0],
+        "source": source,
+        "plane": plane,
         "relief": relief,
         "cell_size": cell,
-        "max_sigma": max_sigma,
         "footprint": footprint,
-        "ground_share": reference.inliers,
+        "ground_share": 0.0,
     }
 
 
-def _cell_without_ground(rho: Floats, rig: Rig) -> float:
-    """Cell size, m, from inverse depths ``rho`` (n,): a pixel at twice the nearest distance."""
+def _cell_without_ground(samples: Samples, rig: Rig) -> float:
+    """Cell size, m: a pixel at twice the nearest distance."""
+    rho = samples.rho[samples.rho > MIN_DEPTH_SIGMAS * samples.sigma]
     # Without any match, 20 baselines stand for the distance.
     # A twentieth of the points may be nearer than the nearest distance: gross mismatches.
     near = 1.0 / float(np.quantile(rho, 0.95)) if rho.size else 20.0 * rig.baseline

@@ -107,8 +107,8 @@ def merge_cells(
     # Unrelated errors (alike = 0) average out; errors of one cause (alike = 1) add up as if there were one model.
     variance = apart + errors.alike * (together * together - apart)
     # Poses drift together, so that their errors do not average out; nor do those of one rig.
-    placed = _total(share * _swing(layers, strip))
-    ranged = _total(share * _stretch(layers, strip, z)) * errors.inverse_depth_std
+    swing, stretch = _by_pose_and_rig(layers, strip, z)
+    placed, ranged = _total(share * swing), _total(share * stretch) * errors.inverse_depth_std
     grey = np.minimum(np.array([layer.gain for layer in layers])[:, None, None] * ortho, 255.0)
     # The eighth power: the best image, but without a visible seam.
     sharp = np.where(np.isfinite(grey), (weight / np.where(top > 0.0, top, 1.0)) ** 8, 0.0)
@@ -132,24 +132,17 @@ def _total(values: Floats) -> Floats:
     return np.asarray(reduce(np.add, values))
 
 
-def _swing(layers: Sequence[ModelLayer], strip: Lattice) -> Floats:
-    """Standard deviations (n, rows, cols) of the elevations by the covariances of (height, rotation about x, y)."""
-    centre = np.array([layer.pose.centre for layer in layers])
+def _by_pose_and_rig(layers: Sequence[ModelLayer], strip: Lattice, z: Floats) -> tuple[Floats, Floats]:
+    """Of the elevations z (n, rows, cols), m: standard deviations by the covariances of (height, rotation about x, y),
+    m; and changes, m^2, by one error, 1/m, of all inverse depths."""
+    centre, forward = (np.array([getattr(layer.pose, name) for layer in layers]) for name in ("centre", "forward"))
     dx, dy = (strip.xs() - centre[:, :1])[:, None, :], (strip.ys() - centre[:, 1:2])[:, :, None]
-    covariance = np.array([layer.pose.covariance for layer in layers])[..., None, None]
+    covariance, dz = (a[..., None, None] for a in (np.array([layer.pose.covariance for layer in layers]), centre[:, 2]))
     tilt = dy * dy * covariance[:, 1, 1] + dx * dx * covariance[:, 2, 2] - 2.0 * dx * dy * covariance[:, 1, 2]
     both = covariance[:, 0, 0] + tilt + 2.0 * (dy * covariance[:, 0, 1] - dx * covariance[:, 0, 2])
-    return np.asarray(np.sqrt(np.maximum(0.0, both)))
-
-
-def _stretch(layers: Sequence[ModelLayer], strip: Lattice, z: Floats) -> Floats:
-    """Changes (n, rows, cols) of the elevations, m^2, by one error, 1/m, of all inverse depths."""
-    x, y, above = strip.xs()[None, :], strip.ys()[:, None], []
-    for pose, elevation in zip([layer.pose for layer in layers], z, strict=True):
-        dx, dy, dz = x - pose.centre[0], y - pose.centre[1], elevation - pose.centre[2]
-        depth = pose.forward[0] * dx + pose.forward[1] * dy + pose.forward[2] * dz
-        above.append(-dz * depth)
-    return np.array(above)
+    ax, ay, az = forward.T[..., None, None]
+    above = z - dz
+    return np.sqrt(np.maximum(0.0, both)), -above * (ax * dx + ay * dy + az * above)
 
 
 def _median(values: Floats, weight: Floats) -> Floats:

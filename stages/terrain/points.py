@@ -52,14 +52,6 @@ class PairPoints:
     def __getitem__(self, which: AnyArray) -> PairPoints:
         return PairPoints(self.position[which], self.sigma_along[which], self.sigma_across[which], self.pixel[which])
 
-    def covariance(self) -> Floats:
-        """Covariances (n, 3, 3), m^2, in the left camera's frame."""
-        ray = self.position / np.linalg.norm(self.position, axis=1, keepdims=True)
-        along = np.einsum("ni,nj->nij", ray, ray)
-        across = np.eye(3) - along
-        squares = (np.square(s, dtype=np.float64)[:, None, None] for s in (self.sigma_along, self.sigma_across))
-        return np.asarray(sum(square * part for square, part in zip(squares, (along, across), strict=True)))
-
 
 def points(disparity: Bundle, rig: Rig, every: int = 1) -> PairPoints:
     """Points of the matched pixels of a pair, row by row.

@@ -24,16 +24,14 @@ Box = tuple[int, int, int, int]
 def footprint(defined: Bools, lattice: Lattice, side: int) -> dict[Tile, Box]:
     """Tiles of ``side`` cells that have a defined cell (rows, cols) of a lattice, and the box of those in each."""
     boxes = {}
-    # Lines count downwards, against y, as rows do.
-    first_col, first_line = lattice.i0, -lattice.j0
-    for ty in range(first_line // side, (first_line + lattice.rows - 1) // side + 1):
-        for tx in range(first_col // side, (first_col + lattice.cols - 1) // side + 1):
-            row, col = max(ty * side - first_line, 0), max(tx * side - first_col, 0)
-            inside = defined[row : (ty + 1) * side - first_line, col : (tx + 1) * side - first_col]
-            lines, columns = (np.flatnonzero(inside.any(axis=axis)).tolist() for axis in (1, 0))
-            if lines:
-                size = columns[-1] - columns[0] + 1, lines[-1] - lines[0] + 1
-                boxes[tx, ty] = (first_col + col + columns[0], first_line + row + lines[0], *size)
+    for tile in lattice.tiles(side):
+        inside = defined[lattice.window(tile)]
+        lines, columns = (np.flatnonzero(inside.any(axis=axis)).tolist() for axis in (1, 0))
+        if lines:
+            # Lines count downwards, against y, as rows do.
+            first_col, first_line = tile.i0, -tile.j0
+            size = columns[-1] - columns[0] + 1, lines[-1] - lines[0] + 1
+            boxes[first_col // side, first_line // side] = (first_col + columns[0], first_line + lines[0], *size)
     return boxes
 
 

@@ -63,7 +63,7 @@ def exact(kind, c=C):
     """The camera that the vectors state; rays of far points do not depend on E."""
     v = VECTORS | {"C": c}
     lens = Bending(tuple(A)) if kind == "CAHV" else Bending(tuple(OPTICAL), tuple(v["R"]))
-    lens = Bending(tuple(OPTICAL), tuple(v["R"]), (0.0, 0.0, 0.0), 0.37) if kind == "CAHVORE" else lens
+    lens = Bending(tuple(OPTICAL), tuple(v["R"]), 0.37) if kind == "CAHVORE" else lens
     return Cahvore(tuple(c), tuple(A), tuple(v["H"]), tuple(v["V"]), lens)
 
 

@@ -28,12 +28,11 @@ class Cahvore:
         depth = np.where(depth > 0, depth, np.nan)
         return np.column_stack([bent @ np.asarray(self.h) / depth, bent @ np.asarray(self.v) / depth])
 
-    def rays(self, pixels: ArrayLike) -> tuple[Floats, Floats]:
-        """Origins (n, 3), m, and unit directions (n, 3) of pixels (n, 2) column, row, in the reference frame."""
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Unit directions (n, 3) of pixels (n, 2) column, row, in the reference frame."""
         p = np.asarray(pixels, np.float64)
         a = np.asarray(self.a)
         directions = np.cross(np.asarray(self.h) - p[:, :1] * a, np.asarray(self.v) - p[:, 1:] * a)
         # The cross product fixes the line, not its sense: rays lead away from the image, ahead.
         directions *= np.sign(directions @ a)[:, None]
-        origins, rays = self.lens.straighten(directions)
-        return origins + self.c, rays
+        return self.lens.straighten(directions)

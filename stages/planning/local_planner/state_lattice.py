@@ -94,17 +94,11 @@ class LatticeGraph:
         price, known = (np.empty((3, HALF_TURN_HEADINGS, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF_TURN_HEADINGS):
             # Of all 16 headings: the turn to the left of the eighth ends at the ninth.
-            after = HEADING_ANGLES[k + 1]
-            dr, dc = 0.5 * HEADING_STEPS[k]
-            for where, (r, c, angle) in enumerate(
-                (
-                    (0.0, 0.0, HEADING_ANGLES[k]),
-                    (dr, dc, HEADING_ANGLES[k]),
-                    (0.0, 0.0, 0.5 * (HEADING_ANGLES[k] + after)),
-                )
-            ):
-                x, y = grid.xy(row + r, col + c)
-                gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + angle))
+            angle, after = HEADING_ANGLES[k : k + 2]
+            for where, (steps, turned) in enumerate(((0.0, angle), (0.5, angle), (0.0, 0.5 * (angle + after)))):
+                dr, dc = steps * HEADING_STEPS[k]
+                x, y = grid.xy(row + dr, col + dc)
+                gaps = footing.gaps(x, y, np.full(x.shape, grid.heading + turned))
                 known[where, k], price[where, k] = prices(gaps, x, y)
         return LatticeGraph(grid, price[0], price[1], price[2], (known[0], known[1], known[2]))
 

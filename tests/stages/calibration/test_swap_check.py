@@ -22,8 +22,8 @@ def test_matches_fit_one_way_round(toe_in):
     left = rng.uniform([0, 0], [640, 480], (4000, 2))
     points = CAMERA.rays(left) * rng.uniform(1.2, 4.0, (4000, 1))
     right = CAMERA.project(T.apply(points)) + rng.normal(0, 0.7, (4000, 2))
-    assert fits(rig, left, right, 4.0) > 0.95
-    assert fits(rig, right, left, 4.0) < 0.45
+    assert fits(rig, left, right) > 0.95
+    assert fits(rig, right, left) < 0.45
 
 
 def seen(camera, T, texture):

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special
 from vehicles import MODEL
 
 from rille.stages.hazard.classification import (
     CAUTION,
     DOUBT_BIT,
     HAZARDOUS,
+    LIFT,
     MAX_EXCESS,
-    STEPS_PER_EXCESS,
     UNKNOWN,
     RiskParams,
-    _table,
+    _chance,
     classify,
 )
 from rille.stages.hazard.measures import MEASURES, HazardInput, Measure
@@ -99,10 +100,12 @@ def test_a_new_measure_is_one_row_and_its_kernel() -> None:
 
 
 def test_the_probability_rises_from_0_to_1_and_is_a_half_near_the_limit() -> None:
-    table = _table()
-    assert (np.diff(table) >= 0).all()
-    assert (table[0], table[-1]) == (0.0, 1.0)
-    assert table[int((MAX_EXCESS - 0.4) * STEPS_PER_EXCESS)] == pytest.approx(
-        0.358, abs=0.01
-    )  # Student's t with 3 degrees
-    assert table[int(MAX_EXCESS * STEPS_PER_EXCESS)] == pytest.approx(0.69, abs=0.01)
+    steps = np.linspace(-MAX_EXCESS, MAX_EXCESS, 2049).astype(np.float32)
+    found = _chance(steps)
+    assert (np.diff(found) >= 0).all()
+    assert (found[0], found[-1]) == (0.0, 1.0)
+    # Student's t with 3 degrees of freedom below the lift, and above it.
+    below, above = steps < -0.4, (steps > 0.2) & (steps < MAX_EXCESS)
+    np.testing.assert_allclose(found[below][1:], special.stdtr(3, steps[below][1:]), atol=1e-6)
+    np.testing.assert_allclose(found[above], special.stdtr(3, steps[above] + LIFT), atol=1e-6)
+    assert _chance(np.zeros(1, np.float32)) == pytest.approx(0.69, abs=0.01)

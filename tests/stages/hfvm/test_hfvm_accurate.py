@@ -263,49 +263,6 @@ def test_relief_keeps_a_step():
     assert np.median(np.abs(found - u)[keep]) < 0.02
 
 
-def test_sweeps_converge_to_the_minimum():
-    """Against the energy's normal equations, written out densely and solved at once."""
-    rng = np.random.default_rng(4)
-    shape, float32 = (7, 9), np.float32
-    n = shape[0] * shape[1]
-    keep = rng.random(shape) < 0.9
-    u, v = np.where(keep, rng.normal(0, 1, (2, *shape)), 0).astype(float32)
-    grey = rng.normal(0, 4, (4, *shape)).astype(float32)
-    grey[0] = np.where(keep, rng.uniform(0.2, 1, shape), 0)
-    across, down = stiff = refinement._stiffness(u, v, keep, float32(2.0), float32(30.0))
-    direction = rng.uniform(0, np.pi, shape)
-    lines = np.stack([np.cos(direction), np.sin(direction), rng.normal(0, 1, shape)], -1).astype(float32)
-    hold, own = float32(50.0), np.arange(n).reshape(shape)
-    matrix, right = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
-
-    def add(weight, columns, factors, target):
-        """One term weight (factors . x - target)^2."""
-        row = np.zeros(2 * n)
-        row[columns] = factors
-        matrix[:], right[:] = matrix + weight * np.outer(row, row), right + weight * target * row
-
-    for y, x in np.argwhere(keep):
-        k = own[y, x]
-        w, gx, gy, rest = (float(plane[y, x]) for plane in grey)
-        add(w, [k, n + k], [gx, gy], rest + gx * u[y, x] + gy * v[y, x])
-        a, b, c = (float(t) for t in lines[y, x])
-        add(float(hold), [k, n + k], [a, b], -c)
-        for start in (0, n):
-            if across[y, x] > 0:
-                add(float(across[y, x]), [start + k - 1, start + k, start + k + 1], [1, -2, 1], 0.0)
-            if down[y, x] > 0:
-                add(float(down[y, x]), [start + k - shape[1], start + k, start + k + shape[1]], [1, -2, 1], 0.0)
-    there = np.tile(keep.ravel(), 2)
-    want = np.zeros(2 * n)
-    want[there] = np.linalg.solve(matrix[np.ix_(there, there)], right[there])
-    normal = np.zeros((5, *shape), float32)
-    refinement._normal(grey, u, v, lines * np.sqrt(hold), keep, stiff, normal)
-    assert np.count_nonzero(normal[0]) == keep.sum()
-    for _ in range(60):
-        u, v = refinement._relax(normal, stiff, u, v)
-    np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), want, atol=2e-3)
-
-
 def test_relief_of_nothing_is_nothing():
     left, right, u, v = slanted(noise=0.0)
     start = (u.astype(np.float32), v.astype(np.float32))

@@ -8,7 +8,6 @@ from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.imaging import undistort
-from rille.stages.imaging.undistort import KERNEL_REACH_PX, PHASES_PER_PX, weights
 
 RAW = Camera(230.0, 229.0, 184.0, 124.0, 376, 240)
 LENSES = {
@@ -68,18 +67,8 @@ def test_principal_point_a_quarter_pixel_further_right():
     image, valid = undistort.undistort(taken(lens, 12.0), lens, moved)
     y, x = np.mgrid[0 : RAW.height, 0 : RAW.width].astype(float)
     ok = valid == 1
-    # Six-point cubic at a 12-pixel period: error of the fourth order, below a tenth of a grey value.
+    # A cubic spline at a 12-pixel period: error of the fourth order, below a tenth of a grey value.
     np.testing.assert_allclose(image[ok], pattern(x - 0.25, y, 12.0)[ok], atol=0.2)
-
-
-def test_weights_sum_to_one_keep_pixels_and_reproduce_cubic_polynomials():
-    table = weights()
-    np.testing.assert_allclose(table.sum(axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(table[0], np.eye(2 * KERNEL_REACH_PX)[KERNEL_REACH_PX - 1], atol=1e-7)
-    np.testing.assert_allclose(table[PHASES_PER_PX], np.eye(2 * KERNEL_REACH_PX)[KERNEL_REACH_PX], atol=1e-7)
-    taps, phase = np.arange(1.0 - KERNEL_REACH_PX, KERNEL_REACH_PX + 1), np.arange(PHASES_PER_PX + 1) / PHASES_PER_PX
-    for n in range(4):
-        np.testing.assert_allclose(table.astype(np.float64) @ taps**n, phase**n, atol=1e-5)
 
 
 def test_without_distortion_the_inside_stays_and_the_border_is_masked():

@@ -61,15 +61,6 @@ def test_sigma_is_what_an_error_of_the_disparity_along_the_epipolar_line_moves()
     np.testing.assert_allclose(found.sigma_across, within * np.linalg.norm(X, axis=1), rtol=1e-3)
 
 
-def test_covariance_is_longest_along_the_ray():
-    found = points(wall()[0], RIG, every=11)
-    values, vectors = np.linalg.eigh(found.covariance())
-    np.testing.assert_allclose(np.sqrt(values[:, 2]), found.sigma_along, rtol=1e-5)
-    np.testing.assert_allclose(np.sqrt(values[:, 0]), found.sigma_across, rtol=1e-5)
-    ray = found.position / np.linalg.norm(found.position, axis=1, keepdims=True)
-    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", vectors[:, :, 2], ray)), 1.0, rtol=1e-9)
-
-
 def test_only_measured_pixels_give_points_and_none_that_may_be_infinitely_far():
     disparity, _ = wall()
     validity, std = np.array(disparity["validity"]), np.array(disparity["disparity_std"])
