@@ -42,7 +42,10 @@ from rille.stages.geometry.geometry import RigidTransform, Sizes
 DEPTH = 4
 """Levels of folders that are searched; deeper ones are other data sets."""
 
-CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json", ".cameramodel")
+CALIBRATIONS = (
+    *(".yaml", ".yml", ".xml", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json"),
+    *(".tsai", ".cameramodel", ".cahv", ".cahvor", ".cahvore"),
+)
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
