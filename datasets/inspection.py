@@ -44,7 +44,7 @@ DEPTH = 4
 
 CALIBRATIONS = (
     *(".yaml", ".yml", ".xml", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json"),
-    *(".tsai", ".cameramodel", ".cahv", ".cahvor", ".cahvore"),
+    *(".tsai", ".cameramodel", ".lbl", ".cahv", ".cahvor", ".cahvore"),
 )
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
@@ -426,7 +426,9 @@ def table_kind(path: Path, pairs: int) -> str:
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
-    except InputError:
+    except InputError as error:
+        if error.code == "RIL-979":  # records of another form, such as NMEA
+            raise
         return named
     table = of_poses(table)
     row = table.values(range(table.columns))[0]

@@ -119,10 +119,16 @@ def with_nine_digits(names: Sequence[str]) -> list[str]:
     return [f"{m.string[: m.start(1)]}{m[1]:0>9}{m.string[m.end(1) :]}" for m in found]
 
 
+def stamps_of(names: Sequence[str]) -> list[str]:
+    """The time in each name, as :func:`stamp_of`; that of a date and time of day, unless all names share one."""
+    whole = with_nine_digits(names)
+    dated = [stamp_of(undated(name)) for name in whole]
+    return dated if len(set(dated)) == len(names) else [stamp_of(name) for name in whole]
+
+
 def times_in_names(paths: Sequence[Path]) -> tuple[float, ...]:
     """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has its own."""
-    stems = with_nine_digits([path.stem for path in paths])
-    stamps = [stamp for stem in stems if (stamp := stamp_of(undated(stem)))]
+    stamps = list(filter(None, stamps_of([path.stem for path in paths])))
     with suppress(InputError):
         return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
     return ()
@@ -228,9 +234,11 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
     """Left and right names that differ in the side's token alone."""
     sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
     for name in names:
-        at = side_of(name)
-        if at is not None:
-            sides[at[0], at[2]][at[1]] = name
+        row, side, neutral = side_of(name) or (0, 0, "")
+        while (more := side_of(neutral)) is not None and more[1] == side:  # left/L_07
+            neutral = more[2]
+        if neutral:
+            sides[row, neutral][side] = name
     return [(of[0], of[1]) for of in sides.values() if len(of) == 2]
 
 

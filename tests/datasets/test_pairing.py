@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import common_headers, join, natural, pair_up, side_of, stamp_of, times_in_names
+from rille.datasets.images.pairing import (
+    common_headers,
+    join,
+    natural,
+    pair_up,
+    side_of,
+    stamp_of,
+    times_in_names,
+    two_sides,
+)
 
 
 def paths(*names: str) -> list[Path]:
@@ -48,6 +57,16 @@ def test_nanoseconds_need_not_have_their_zeros(mark):
     assert [(pair.left, pair.right) for pair in pairs] == list(zip(*sides, strict=True))
     times = np.array(times_in_names([pair.left for pair in pairs])) - 1.7e9
     np.testing.assert_allclose(times, [0.05 + 0.3 * k for k in range(12)], atol=1e-6)
+
+
+def test_a_date_that_all_names_share_hides_no_time_stamp():
+    names = [f"n015-2018-07-24-11-22-45+0800__CAM_FRONT__{1532402927612460 + 62500 * k}.jpg" for k in range(4)]
+    np.testing.assert_allclose(np.diff(times_in_names(paths(*names))), 0.0625, atol=1e-6)
+
+
+def test_names_of_two_sides_may_say_their_side_twice():
+    names = [f"{side}/{side[0].upper()}_{k:03d}.cahv" for k in (0, 1) for side in ("right", "left")]
+    assert two_sides([*names, "left/R_002.cahv"]) == [(names[1], names[0]), (names[3], names[2])]
 
 
 def test_decimals_are_no_nanoseconds_without_zeros():
