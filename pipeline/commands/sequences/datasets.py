@@ -9,6 +9,7 @@ from cyclopts import App
 from rille.datasets import registry
 from rille.datasets.export import export
 from rille.datasets.protocol import Source
+from rille.pipeline.engine.runtime.atomic import named
 from rille.pipeline.engine.spec import Spec
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import Ref
@@ -50,4 +51,5 @@ def export_dataset(seq: str, directory: Path, *, assignments: Assignments = (), 
         return ensure(store.root, Spec(source.module, label, source.params, source.args, source.hints), refs).ref
 
     sequence = registry.open_sequence(seq, for_dataset)
-    print(export(sequence, directory, lambda source: store.open(artifact(source))))
+    with named(directory):
+        print(export(sequence, directory, lambda source: store.open(artifact(source))))
