@@ -34,7 +34,7 @@ from rille.datasets.poses import (
     untimed,
 )
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
-from rille.datasets.text.tables import read_table
+from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -427,7 +427,7 @@ def table_kind(path: Path, pairs: int) -> str:
     try:
         table = read_table(path, "table")
     except InputError as error:
-        if error.code == "RIL-979":  # records of another form, such as NMEA
+        if error.remedy == ROWS:  # records of another form, such as NMEA
             raise
         return named
     table = of_poses(table)

@@ -28,6 +28,12 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", r
 STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
 """Beginnings of files with records of another form: GPX and KML are XML."""
 
+ROWS = (
+    "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
+    "time,latitude,longitude,altitude in degrees and metres"
+)
+"""Remedy for these."""
+
 CRS = re.compile(
     r"(EPSG:4\d{3}|\+proj=(?:latlong|longlat)\b.*)|EPSG:\d+|\+proj=.*|WGS ?84 UTM \d\d?[NS]", re.IGNORECASE
 )
@@ -138,9 +144,7 @@ def read_table(path: Path, what: str) -> TextTable:
     """
     lines = read_lines(path, what)
     if form := STRUCTURED.match("\n".join(lines[:SAMPLE])):
-        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
-        remedy += "time,latitude,longitude,altitude in degrees and metres"
-        raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=remedy)
+        raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=ROWS)
     names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
