@@ -34,7 +34,7 @@ from rille.datasets.poses import (
     untimed,
 )
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
-from rille.datasets.text.tables import read_table
+from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError, RilleError
 from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import RigidTransform, Sizes
@@ -42,7 +42,10 @@ from rille.stages.geometry.geometry import RigidTransform, Sizes
 DEPTH = 4
 """Levels of folders that are searched; deeper ones are other data sets."""
 
-CALIBRATIONS = (".yaml", ".yml", ".xml", ".tsai", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json", ".cameramodel")
+CALIBRATIONS = (
+    *(".yaml", ".yml", ".xml", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json"),
+    *(".tsai", ".cameramodel", ".lbl", ".cahv", ".cahvor", ".cahvore"),
+)
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
@@ -423,7 +426,9 @@ def table_kind(path: Path, pairs: int) -> str:
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
-    except InputError:
+    except InputError as error:
+        if error.remedy == ROWS:  # records of another form, such as NMEA
+            raise
         return named
     table = of_poses(table)
     row = table.values(range(table.columns))[0]

@@ -218,7 +218,7 @@ class Run:
         """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
 
         y falls: ``terrain.sel(y=slice(0.6, 0.4))``. ``terrain.to_netcdf(path)`` and ``terrain.to_zarr(path)`` save it.
-        Its arrays are dask's, read in parts; ``terrain.load()`` takes them into memory, as medians and quantiles need.
+        An array is read where it is used; ``terrain.chunk()`` makes them dask's, for terrains larger than the memory.
 
         Raises
         ------
@@ -233,7 +233,7 @@ class Run:
 
         with self._reading():
             check_group(self.file("terrain.zarr"))
-            terrain: xarray.Dataset = xarray.open_zarr(self.file("terrain.zarr"))
+            terrain: xarray.Dataset = xarray.open_zarr(self.file("terrain.zarr"), chunks=None)
         for variable in terrain.variables.values():
             variable.attrs.pop("_CRS", None)  # GDAL's own, a mapping: NetCDF stores none; `spatial_ref` says the same
             for codec in ("compressors", "filters"):  # those of zarr 2, which `to_zarr` refuses in its own format 3

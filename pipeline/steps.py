@@ -20,6 +20,7 @@ their attributes carry the facts and settings that the next step needs.
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
@@ -182,9 +183,12 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
     (9, ('row', 'col'))
     """
     words = assignments(settings)
-    opened = registry.open_sequence(place_of(path, "path"), config.merge({}, settings))
+    place = place_of(path, "path")
+    opened = registry.open_sequence(place, config.merge({}, settings))
+    # Opened anew by another process, or after the program has changed its folder, it is the same one.
+    same = place if place in (*registry.BUILT_IN, *registry.MANIFESTS) else os.path.abspath(place)
     said = (word for one in words for word in ("--set", one))
-    return StereoSequence(replace(opened, opened=(*opened.opened, *said)))
+    return StereoSequence(replace(opened, opened=(same, *said)))
 
 
 def _reopened(path: str, *assigned: str) -> StereoSequence:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 
 import numpy as np
 import pytest
@@ -36,6 +37,14 @@ def test_every_parameter_is_explained_and_has_a_default(name: str) -> None:
         assert DECLARED[name].params.meanings().get(key), f"{name}.{key} is not explained"
         assert not field.is_required(), f"{name}.{key} has no default"
     DECLARED[name].params()
+
+
+@pytest.mark.parametrize("name", stages())
+def test_an_argument_that_may_be_absent_has_a_default(name: str) -> None:
+    """The dataflow leaves out an argument that is None."""
+    for parameter in inspect.signature(DECLARED[name].function or DECLARED[name].run).parameters.values():
+        absent = str(parameter.annotation).endswith("| None")
+        assert not absent or parameter.default is None, f"{name}: {parameter.name} has no default"
 
 
 class Short(Params):

@@ -20,8 +20,8 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 KNOWN = (
     "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
     "camodocal, VINS, Basalt, mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, "
-    "Middlebury calib.txt, KITTI, K.txt, ASP .tsai and PDS3 or VICAR labels (CAHV, CAHVOR, CAHVORE) are read; of "
-    "another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
+    "Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) are read; "
+    "of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
     "transposed), as OpenCV's YAML"
 )
 
@@ -100,5 +100,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
         if knows(fields):
             found = read_fields(fields, path)
             fields.check_lens()
+            if any(camera.T_camera_reference is None for camera in found):
+                fields.check_turn()
             return found
     raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)

@@ -50,6 +50,13 @@ LENS = re.compile(
 COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radial|tangential|coef", re.I)
 """Keys of single coefficients: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
 
+TURN = re.compile(
+    r"(?:left_|right_)?"
+    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*)",
+    re.I,
+)
+"""Keys that say how a camera is turned."""
+
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
 """Part of keys that only look like those of a lens: of its errors, or of names."""
 
@@ -114,7 +121,7 @@ class Fields:
 
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
         """A list of ``count`` finite numbers; a matrix row by row."""
-        flat = _flat(self.get(key))
+        flat = flattened(self.get(key))
         if flat is None:
             raise self.error("RIL-115", key, f"is {_shown(self.values[key])}, it should be a list of numbers")
         if count is not None and len(flat) != count:
@@ -222,7 +229,7 @@ class Fields:
         named = {key: model for key, value in self.values.items() if (model := _named(key, value))}
         self.used |= {self.at + key for key in named}
         keys = {model: key for key, model in named.items()}
-        if not _any_but_zero(_flat(self.values.get(coefficients)) or [1]):
+        if not _any_but_zero(flattened(self.values.get(coefficients)) or [1]):
             keys.pop("realsense", None)
         if unread := keys.get("unread", keys.get("realsense")):
             text = f"= {_shown(self.values[unread])} is a lens model that is not read"
@@ -242,6 +249,16 @@ class Fields:
             text = f"= {_shown(value)} seems to describe the lens, and is not read there"
             remedy = "state the lens by the keys of its format (e.g. distortion_model), or remove the entry"
             raise InputError("RIL-810", f"{self.file}: {key} {text}", remedy=remedy)
+
+    def check_turn(self) -> None:
+        """Refuse entries that turn a camera and were not read, without which the cameras would be parallel."""
+        for key, value in self.values.items():
+            numbers = flattened(value) or [value]
+            # 16: of a 4 x 4 matrix; more are of the views of a chessboard.
+            turns = isinstance(value, Mapping) or (len(numbers) <= 16 and _any_but_zero(numbers))
+            if turns and TURN.fullmatch(key) and self.at + key not in self.used:
+                remedy = "state it as R, a 3 x 3 matrix, with T (m), x_right = R x_left + T; or remove it"
+                raise self.error("RIL-766", key, "seems to turn a camera, and is not read there", remedy)
 
     def _number(self, key: str, value: Any) -> float:
         try:
@@ -305,7 +322,7 @@ def _any_but_zero(values: Iterable[Any]) -> bool:
 def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tuple[str, Any]]:
     """Full key and value of entries of a lens that no reader has read, except coefficients of zero."""
     for key, value in ((str(k), v) for k, v in values.items()):
-        path, flat = at + key, _flat(value)
+        path, flat = at + key, flattened(value)
         if isinstance(value, Mapping) and flat is None:
             yield from _untaken(value, f"{path}.", used)
         elif path not in used and not OTHER.search(path):
@@ -314,7 +331,7 @@ def _untaken(values: Mapping[Any, Any], at: str, used: set[str]) -> Iterator[tup
                 yield path, value
 
 
-def _flat(value: Any) -> list[Any] | None:
+def flattened(value: Any) -> list[Any] | None:
     """Numbers of a list, of lists in a list, or of a matrix that has ``data``; None for anything else."""
     if isinstance(value, Mapping) and "data" in value:
         return _matrix_data(value)
@@ -322,12 +339,12 @@ def _flat(value: Any) -> list[Any] | None:
         return list(value.reshape(-1).tolist())
     if not isinstance(value, list | tuple):
         return None
-    parts = (_flat(one) if isinstance(one, list | tuple) else [one] for one in value)
+    parts = (flattened(one) if isinstance(one, list | tuple) else [one] for one in value)
     return [one for part in parts for one in part or []]
 
 
 def _matrix_data(value: Mapping[Any, Any]) -> list[Any] | None:
-    data, rows, columns = _flat(value["data"]), str(value.get("rows")), str(value.get("cols"))
+    data, rows, columns = flattened(value["data"]), str(value.get("rows")), str(value.get("cols"))
     # Nine digits are enough; int() raises another error for thousands of them.
     if data is not None and rows.isdecimal() and columns.isdecimal() and int(rows[:9]) * int(columns[:9]) != len(data):
         return None

@@ -162,10 +162,7 @@ def matrix(text: str, path: Path) -> list[CalibratedCamera]:
 
 
 GROUP = re.compile(r"(in|ex)trinsics?|camera|stereo|rig|calibration")
-TURN = re.compile(
-    r"R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|T_(right_left|left_right)|toe_?in\w*", re.I
-)
-"""In a file of figures by key: parts with entries of their own, and keys that say how one camera is turned."""
+"""Parts of a file of figures by key that have entries of their own."""
 
 
 def _flat(f: Fields) -> Fields:
@@ -196,19 +193,19 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
 
     ``x_right = R x_left + T``, metres; with ``baseline`` alone the cameras are parallel.
     """
-    lenses = []
-    for part in _parts(f):
+    lenses, parts = [], _parts(f)
+    for part in parts:
         listed = "coeffs" in part and "model" in part  # as RealSense's library states them
         lens = part.optics(f"fx fy {_centre(part)}", part.size("width", "height"), "none" if listed else "")
         lenses.append(part.distorted("coeffs", lens.camera) if listed else lens)
     rig = _flat(f)
+    if "ppx" in parts[0] and len(rig.values.get("rotation") or ()) == 9:
+        # librealsense's ``rs2_extrinsics`` lists its rotation column by column.
+        rig.values["rotation"] = np.reshape(rig.values["rotation"], (3, 3)).T
     T_right_left = relative(rig)
     if T_right_left is None and "baseline" in rig:
         T_right_left = parallel(rig.number("baseline"))
-    for key in rig.values:
-        if TURN.fullmatch(key) and key not in rig.used:
-            remedy = "state it as R, a 3 x 3 matrix, with T (m), x_right = R x_left + T; or remove it"
-            raise rig.error("RIL-766", key, "seems to turn a camera, and is not read there", remedy)
+    rig.check_turn()
     if T_right_left is not None:
         return stereo_cameras(lenses[0], lenses[-1], T_right_left)
     names = CAMERAS if lenses[1:] else [path.stem]

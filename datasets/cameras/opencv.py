@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields
+from rille.datasets.cameras.fields import Fields, flattened
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.arrays import Floats
@@ -30,7 +30,8 @@ MESSAGE = {"K": "camera_matrix", "D": "distortion_coefficients", "R": "rectifica
 WIDTHS = ("image_width", "image_Width", "width", "LEFT.width", "Camera.width")
 HEIGHTS = ("image_height", "image_Height", "height", "LEFT.height", "Camera.height")
 ROTATIONS, TRANSLATIONS = ("R", "rotation_matrix", "rotation"), ("T", "translation_vector", "translation")
-POSE = (*ROTATIONS, *TRANSLATIONS)
+WHOLE = "T_right_left"
+POSE = (*ROTATIONS, *TRANSLATIONS, WHOLE)
 
 OST = re.compile(r"^\[?([a-z][\w/ ]*)\]?[ \t]*\n((?:[ \t]*[-+.\d].*\n?|[ \t]*\n)*)", re.MULTILINE)
 OST_KEYS = {
@@ -50,7 +51,7 @@ def sides(f: Fields) -> list[tuple[str, str]]:
     for key, value in f.values.items():
         parts = KEY.fullmatch(key)
         side = (parts[1] or parts[3] or "").lower() if parts else ""
-        if parts is None or not side or not isinstance(value, Mapping | list):  # k1 may be a coefficient
+        if parts is None or not side or flattened(value) is None:  # k1 may be a coefficient
             continue
         what = re.sub("[._ ]", "", parts[2]).lower()
         matrix = MATRIX.fullmatch(what) is not None
@@ -177,7 +178,9 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
 
 
 def relative(f: Fields) -> RigidTransform | None:
-    """T_right_left of R and T; None if there is neither."""
+    """T_right_left, stated as such or by R and T; None if there is none."""
+    if WHOLE in f:
+        return f.pose(WHOLE)
     return f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS)) if f.has(*POSE) else None
 
 

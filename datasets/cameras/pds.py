@@ -1,19 +1,23 @@
-"""Cameras in PDS3 and VICAR labels: CAHV, CAHVOR and CAHVORE (``GEOMETRIC_CAMERA_MODEL``).
+"""Cameras in PDS3 and VICAR labels (``GEOMETRIC_CAMERA_MODEL``), and in texts of their vectors: CAHV, CAHVOR, CAHVORE.
 
 Components 1 to 7 are C, A, H, V, O, R and E; 8 is the type of a CAHVORE (1 perspective, 2 fisheye, 3 general) and 9 the
 linearity of type 3. Pixels count from 0 at the centre of the first one. The label may stand before the image in one
 file. Source: PDS3 data dictionary, ``GEOMETRIC_CAMERA_MODEL`` and ``MODEL_COMPONENT_1`` to ``_9``.
+
+JPL's programs write the vectors as a text (``.cahv``, ``.cahvor``, ``.cahvore``): ``Model = CAHVOR = ...``, or
+``CAHVORE3,0.5`` with type and linearity; ``Dimensions = WIDTH HEIGHT``; and a line for each vector, ``C = X Y Z``.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rille.datasets.cameras.fields import Fields
-from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
+from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import SMALL, open_regular
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import Camera
@@ -29,6 +33,9 @@ PROPERTY_END = re.compile(r"\b(?:PROPERTY|TASK)='")
 COMPONENT = re.compile(r"\bMODEL_COMPONENT_([1-9])\s*=\s*(\([^()]{0,400}\)|[^\s(),]{1,60})")
 TYPE = re.compile(r"\bMODEL_TYPE\s*=\s*[\"']?([A-Z]{1,20})\b")
 UNIT = re.compile(r"<[^<>]{0,40}>")
+TEXT = re.compile(r"^[ \t]*Model[ \t]*=[ \t]*(CAHV[A-Z]{0,20})(?:(\d),([-+.\deE]{1,60}))?", re.MULTILINE)
+VECTOR = re.compile(r"^[ \t]*([CAHVORE]|Dimensions)[ \t]*=(.{0,400})$", re.MULTILINE)
+"""Of a text of vectors: the model with its type and linearity, and a vector or the size of the images."""
 
 MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 
@@ -50,14 +57,14 @@ def attached(path: Path) -> str:
 
 
 def is_label(text: str) -> bool:
-    """Whether this is the text of a label with a camera."""
-    return bool(_model(text))
+    """Whether this is the text of a label with a camera, or of the vectors of one."""
+    return bool(_model(text) or TEXT.search(text))
 
 
 def label(text: str, path: Path) -> list[CalibratedCamera]:
     """The camera, named by its file; its pose refers to the label's frame. The lens is that of far points.
 
-    The image size is unknown.
+    A label does not state the image size.
     """
     f = _entries(text, path)
     kind = f.text("MODEL_TYPE")
@@ -95,7 +102,7 @@ def _pinhole(f: Fields) -> tuple[Camera, Floats, float]:
     skew, fy = float(v @ x), float(v @ y)
     if fy < 0:
         raise f.error("RIL-953", "MODEL_COMPONENT_4", "mirrors the image", "give a model without mirroring")
-    return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), UNKNOWN_SIZE), np.array([x, y, a]), skew
+    return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), f.pair_of_pixels("Dimensions")), np.array([x, y, a]), skew
 
 
 def _model(text: str) -> str:
@@ -107,9 +114,16 @@ def _model(text: str) -> str:
 
 
 def _entries(text: str, path: Path) -> Fields:
-    """The first camera model of a label: its type and components."""
+    """The first camera model of a label, or that of a text of vectors: its type and components."""
     part = UNIT.sub(" ", _model(text))
-    values: dict[str, object] = {}
+    if not part and (model := TEXT.search(text)):
+        kind, type_, linearity = model.groups()
+        lines = Fields({name: numbers.split() for name, numbers in VECTOR.findall(text)}, str(path))
+        # The name of a model spells its vectors.
+        vectors = {f"MODEL_COMPONENT_{k}": lines.numbers(v, 3) for k, v in enumerate("CAHVORE", start=1) if v in kind}
+        values = vectors | {"MODEL_TYPE": kind, "MODEL_COMPONENT_8": type_, "MODEL_COMPONENT_9": linearity}
+        return Fields({**values, "Dimensions": lines.values.get("Dimensions")}, str(path))
+    values = dict[str, Any]()
     for number, value in COMPONENT.findall(part):
         words = value.strip("()").replace(",", " ").split()
         values.setdefault(f"MODEL_COMPONENT_{number}", words if len(words) > 1 else words[0] if words else None)

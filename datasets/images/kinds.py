@@ -44,6 +44,10 @@ KINDS: dict[str, tuple[str, str]] = {
         ".webp .jp2 .j2k .pbm .pam .exr .hdr .heic .heif .avif .jxl .gif .tga .dng .nef .cr2 .cr3 .arw .raf .orf .rw2",
         "convert them: magick mogrify -format png FILES",
     ),
+    "planetary image": (
+        ".img .vic .vicar .cub .fit .fits",
+        "convert them, without a stretch of each: gdal_translate -of PNG -ot UInt16 FILE FILE.png",
+    ),
     "headerless image": (
         ".raw .bin .yuv .bayer",
         "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",

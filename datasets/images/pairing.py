@@ -24,6 +24,9 @@ from rille.stages.core.quantities import count
 STAMP = re.compile(r"(?<!\d)[1-9]\d{9}(?:[_-]\d{9}|\d*(?:\.\d+)?)(?!\d)")
 """Seconds since 1970 have ten digits, with fractions more; frame numbers have fewer, or leading zeros."""
 
+NANOSECONDS = re.compile(r"(?<!\d)[1-9]\d{9}[._-]([1-9]\d{0,8}|0)(?!\d)")
+"""Seconds since 1970 and nanoseconds, perhaps without the zeros in front of them."""
+
 SHARE, MOST_APART = 0.25, 0.01
 """Largest time between the images of a pair: share of the usual interval, and seconds (0.1 m at 10 m/s)."""
 
@@ -104,9 +107,28 @@ def stamp_of(name: str) -> str:
     return re.sub("[_-]", ".", found[0]) if found else ""
 
 
+def with_nine_digits(names: Sequence[str]) -> list[str]:
+    """Names in which nanoseconds after seconds since 1970 have nine digits.
+
+    Programs that join the two numbers of a stamp of ROS write 50 ms as ``1700000000.50000000``. Where decimals have up
+    to nine digits some begin with 0, and the names stay as they are.
+    """
+    found = [match for name in names if (match := NANOSECONDS.search(name))]
+    if len(found) < len(names) or max((len(match[1]) for match in found), default=0) < 9:
+        return list(names)
+    return [f"{m.string[: m.start(1)]}{m[1]:0>9}{m.string[m.end(1) :]}" for m in found]
+
+
+def stamps_of(names: Sequence[str]) -> list[str]:
+    """The time in each name, as :func:`stamp_of`; that of a date and time of day, unless all names share one."""
+    whole = with_nine_digits(names)
+    dated = [stamp_of(undated(name)) for name in whole]
+    return dated if len(set(dated)) == len(names) else [stamp_of(name) for name in whole]
+
+
 def times_in_names(paths: Sequence[Path]) -> tuple[float, ...]:
     """Times in the names of sorted files, s, since 1970 or as date and time of day; empty unless each has its own."""
-    stamps = [stamp for path in paths if (stamp := stamp_of(undated(path.stem)))]
+    stamps = list(filter(None, stamps_of([path.stem for path in paths])))
     with suppress(InputError):
         return seconds(stamps, "the image names") if len(stamps) == len(paths) else ()
     return ()
@@ -158,13 +180,14 @@ def in_order(stems: Sequence[str]) -> list[str]:
 
 def _ascending(stems: Sequence[str]) -> list[str]:
     """Names without their side, ordered by time stamps or decimal numbers in them, else in natural order."""
-    found = [DECIMAL.fullmatch(stem) for stem in stems]
+    whole = with_nine_digits(stems)
+    found = [DECIMAL.fullmatch(stem) for stem in whole]
     numbers = [match[2] for match in found if match]
     fractions = [number.partition(".")[2] for number in numbers]
     # Fractions of unlike length with a final 0 are numbers of their own: 1.9 before 1.10.
     counts = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
-    values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in stems]
+    values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in whole]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
     return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
 
@@ -211,9 +234,11 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
     """Left and right names that differ in the side's token alone."""
     sides: dict[tuple[int, str], dict[int, str]] = defaultdict(dict)
     for name in names:
-        at = side_of(name)
-        if at is not None:
-            sides[at[0], at[2]][at[1]] = name
+        row, side, neutral = side_of(name) or (0, 0, "")
+        while (more := side_of(neutral)) is not None and more[1] == side:  # left/L_07
+            neutral = more[2]
+        if neutral:
+            sides[row, neutral][side] = name
     return [(of[0], of[1]) for of in sides.values() if len(of) == 2]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rille.datasets import protocol
 from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
-from rille.datasets.images.pairing import ImagePair, ends, stamp_of
+from rille.datasets.images.pairing import ImagePair, ends, stamps_of
 from rille.datasets.imu import at_frames, read_imu
 from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
 from rille.datasets.manifest.rig import direction
@@ -126,8 +126,9 @@ class MotionReader:
     def stamps_of_names(self, unit: str) -> tuple[str, list[tuple[str, int]]]:
         """The ``unit``, and the time stamp in each left image's name (a date, one since 1970, or its last number) with
         the pair's number."""
-        stems = [undated(pair.left.stem) for pair in self.pairs]
-        stamps = [stamp_of(stem) or ["", *re.findall(r"\d+(?:\.\d+)?", stem)][-1] for stem in stems]
+        stems = [pair.left.stem for pair in self.pairs]
+        last = (["", *re.findall(r"\d+(?:\.\d+)?", undated(stem))][-1] for stem in stems)
+        stamps = [stamp or number for stamp, number in zip(stamps_of(stems), last, strict=True)]
         wrong = stamps.index("") if "" in stamps else 0
         small = unit == "auto" and len(stamps) > 2 and "" not in stamps and float(stamps[0]) < 1e8
         if "" in stamps or (small and set(np.diff(np.array(stamps, float))) == {1}):

@@ -2,7 +2,8 @@
 
 Columns are separated by commas, semicolons, tabs or blanks. The last line of words before the first row has the names
 of the columns, with or without a leading ``#`` or ``%``, and a line of units below it their units; later comments are
-skipped. A date and time of day at the beginning of a row is a number of seconds. Cells may be empty.
+skipped. Below a CRS, as in OpenDroneMap's ``geo.txt``, the columns are image, x, y and z. A date and time of day at the
+beginning of a row is a number of seconds. Cells may be empty.
 """
 
 from __future__ import annotations
@@ -26,6 +27,17 @@ from rille.stages.core.quantities import count
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
 STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
 """Beginnings of files with records of another form: GPX and KML are XML."""
+
+ROWS = (
+    "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
+    "time,latitude,longitude,altitude in degrees and metres"
+)
+"""Remedy for these."""
+
+CRS = re.compile(
+    r"(EPSG:4\d{3}|\+proj=(?:latlong|longlat)\b.*)|EPSG:\d+|\+proj=.*|WGS ?84 UTM \d\d?[NS]", re.IGNORECASE
+)
+"""A coordinate reference system, of degrees or in a plane, as the first line of OpenDroneMap's ``geo.txt``."""
 
 DATE = re.compile(r"\s*[\"']?\d{4}[-/.]\d\d?[-/.]\d")
 
@@ -132,9 +144,7 @@ def read_table(path: Path, what: str) -> TextTable:
     """
     lines = read_lines(path, what)
     if form := STRUCTURED.match("\n".join(lines[:SAMPLE])):
-        remedy = "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
-        remedy += "time,latitude,longitude,altitude in degrees and metres"
-        raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=remedy)
+        raise InputError("RIL-979", f"{what} {path} is {form.lastgroup}, no table", remedy=ROWS)
     names, units, separator, columns = "", tuple[str, ...](), None, 0
     rows: list[tuple[str, ...]] = []
     at: list[int] = []
@@ -146,9 +156,9 @@ def read_table(path: Path, what: str) -> TextTable:
         if not rows:
             # Set by every line up to the first row, which decides, since comments may hold commas.
             separator = next((s for s in ",;" if s in text), None)
-            columns = len(split(names, separator or ("\t" if "\t" in names else None)))
+            columns = 0 if CRS.fullmatch(names) else len(split(names, separator or ("\t" if "\t" in names else None)))
         row = split(text, separator, columns)
-        if not rows and not NUMBER.match(row[0]) and not _named(row, columns):
+        if not rows and not NUMBER.match(row[0]) and not _named(row, columns or len(row)):
             text = text.lstrip("#%").strip()
             cells = split(text, separator, columns)
             below = names and len(cells) == len(split(names, separator, columns))
@@ -166,10 +176,18 @@ def read_table(path: Path, what: str) -> TextTable:
         text = f"{what} {path} has no rows that begin with a number{last}"
         raise InputError("RIL-286", text, remedy="check that it is the right file; dates are as 2026-05-31 12:00:00")
     header = split(names, separator, columns)
-    header = header if len(header) == columns else ()
+    header = header if len(header) == columns else _of_places(names, columns)
     if len(units) == columns:
         header = tuple(f"{n} [{u.strip('[]()')}]" if u else n for n, u in zip(header, units, strict=False))
     return TextTable(str(path), tuple(name.lower() for name in header), tuple(rows), tuple(at), separator is not None)
+
+
+def _of_places(names: str, columns: int) -> tuple[str, ...]:
+    """Names of the columns below a CRS: an image, its place, and others that are not read; none if there is no CRS."""
+    if (crs := CRS.fullmatch(names)) is None:
+        return ()
+    place = ("longitude", "latitude", "altitude") if crs[1] else ("x", "y", "z")
+    return ("image", *place, *(f"column {k}" for k in range(5, columns + 1)))[:columns]
 
 
 def _named(row: tuple[str, ...], columns: int) -> bool:

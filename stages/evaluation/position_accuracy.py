@@ -187,7 +187,7 @@ def position_accuracy_stage(
     *,
     frames: list[int],
     truth: TruePositions,
-    moments: Sequence[float | None] | None,
+    moments: Sequence[float | None] | None = None,
 ) -> Bundle[AccuracyFacts]:
     """Trajectory against positions without rotation, of a frame and a clock of their own."""
     poses = by_frame(world_poses(trajectory), trajectory.meta["frames"], frames)

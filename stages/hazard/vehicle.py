@@ -53,6 +53,16 @@ class Vehicle(Params):
         return 0.5 * (self.wheel_base + self.wheel_diameter)
 
     @model_validator(mode="after")
+    def _one_unit_of_length(self) -> Vehicle:
+        # 100: of metres beside centimetres; of a long lorry 5.
+        if not 0.01 < self.wheel_base / self.track < 100.0:
+            raise ValueError(
+                f"wheel_base {self.wheel_base:g} m and track {self.track:g} m are not those of one vehicle: "
+                "give both in metres, at the scale of the sequence"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _belly_clears_what_wheels_climb(self) -> Vehicle:
         if self.max_step > self.clearance:
             raise ValueError(

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import common_headers, join, natural, pair_up, side_of, stamp_of
+from rille.datasets.images.pairing import (
+    common_headers,
+    join,
+    natural,
+    pair_up,
+    side_of,
+    stamp_of,
+    times_in_names,
+    two_sides,
+)
 
 
 def paths(*names: str) -> list[Path]:
@@ -34,6 +43,35 @@ def found(left: list[Path], right: list[Path], rule: str = "auto") -> list[tuple
 def test_pairs_stand_in_the_order_of_the_decimals_in_their_names(names):
     sides = [paths(*(f"{side}/{name}.png" for name in random.Random(3).sample(names, len(names)))) for side in "lr"]
     assert [pair.name for pair in pair_up(*sides)] == names
+
+
+@pytest.mark.parametrize("mark", ["_", ".", "-"])
+def test_nanoseconds_need_not_have_their_zeros(mark):
+    """ROS's two numbers of a stamp, joined: 50 ms are ``1700000000_50000000``."""
+    stamps = [1_700_000_000_050_000_000 + 300_000_000 * k for k in range(12)]
+    sides = [
+        paths(*(f"{side}/{later // 10**9}{mark}{later % 10**9}.png" for later in (stamp + shift for stamp in stamps)))
+        for side, shift in (("l", 0), ("r", 2_000_000))
+    ]
+    pairs = pair_up(*(random.Random(3).sample(side, len(side)) for side in sides))
+    assert [(pair.left, pair.right) for pair in pairs] == list(zip(*sides, strict=True))
+    times = np.array(times_in_names([pair.left for pair in pairs])) - 1.7e9
+    np.testing.assert_allclose(times, [0.05 + 0.3 * k for k in range(12)], atol=1e-6)
+
+
+def test_a_date_that_all_names_share_hides_no_time_stamp():
+    names = [f"n015-2018-07-24-11-22-45+0800__CAM_FRONT__{1532402927612460 + 62500 * k}.jpg" for k in range(4)]
+    np.testing.assert_allclose(np.diff(times_in_names(paths(*names))), 0.0625, atol=1e-6)
+
+
+def test_names_of_two_sides_may_say_their_side_twice():
+    names = [f"{side}/{side[0].upper()}_{k:03d}.cahv" for k in (0, 1) for side in ("right", "left")]
+    assert two_sides([*names, "left/R_002.cahv"]) == [(names[1], names[0]), (names[3], names[2])]
+
+
+def test_decimals_are_no_nanoseconds_without_zeros():
+    names = ["1700000000.05", "1700000000.123456789", "1700000000.35"]
+    assert times_in_names(paths(*(f"{name}.png" for name in names))) == tuple(map(float, names))
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,16 @@ def vicar(kind, rows):
     return f"LBLSIZE={len(text) + 16:<8d}" + text
 
 
+def vectors(kind, rows):
+    """The text that JPL's programs write."""
+    *rows, type_, linearity = rows if kind == "CAHVORE" else [*rows, None, None]
+    model = f"{kind}{type_:.0f},{linearity} = general" if type_ else f"{kind} = perspective, distortion"
+    lines = [f"{name} = {' '.join(map(repr, row))}" for name, row in zip("CAHVORE", rows, strict=False)]
+    return "\n".join(
+        ["# camera", f"Model = {model}", "Dimensions = 1024 768", "", *lines, "Hs    = 900", "S internal =", ""]
+    )
+
+
 def put(tmp_path, text, image=b"", name="left.IMG"):
     path = tmp_path / name
     path.write_bytes(text.encode() + image)
@@ -67,11 +77,12 @@ def exact(kind, c=C):
     return Cahvore(tuple(c), tuple(A), tuple(v["H"]), tuple(v["V"]), lens)
 
 
-@pytest.mark.parametrize("form", [pds, vicar])
+@pytest.mark.parametrize("form", [pds, vicar, vectors])
 @pytest.mark.parametrize("kind", KINDS)
 def test_lens_and_pose_image_points_as_the_label_says(tmp_path, kind, form):
-    (camera,) = read_cameras(put(tmp_path, form(kind, components(kind)), b"\0\xff\xfe" * 100))
-    assert camera.size is None
+    image = b"" if form is vectors else b"\0\xff\xfe" * 100
+    (camera,) = read_cameras(put(tmp_path, form(kind, components(kind)), image))
+    assert camera.size == ((1024, 768) if form is vectors else None)
     assert camera.name == "left"
     rng = np.random.default_rng(1)
     offset = rng.uniform(-0.5, 0.5, (1000, 2)) @ np.array([ACROSS, DOWN])
@@ -116,6 +127,12 @@ def test_two_labels_are_a_rig(tmp_path):
 def test_a_wrong_label_is_one_line(tmp_path, change, code):
     with raises(code, "left.IMG", "GEOMETRIC_CAMERA_MODEL."):
         read_cameras(put(tmp_path, pds("CAHVOR", components("CAHVOR")).replace(*change)))
+
+
+@pytest.mark.parametrize(("change", "code"), [(("V =", "W ="), "RIL-113"), (("V =", "V = 1.0"), "RIL-116")])
+def test_a_wrong_text_of_vectors_names_the_vector(tmp_path, change, code):
+    with raises(code, "left.cahvor: V "):
+        read_cameras(put(tmp_path, vectors("CAHVOR", components("CAHVOR")).replace(*change), name="left.cahvor"))
 
 
 def test_vectors_that_are_no_camera_are_refused(tmp_path):

@@ -76,6 +76,29 @@ def test_a_name_may_stand_first_in_a_row(tmp_path):
     assert of_airsim.values([1, 2]).tolist() == [[5, 1], [6, 2]]
 
 
+@pytest.mark.parametrize(
+    ("crs", "place"),
+    [
+        ("EPSG:4326", ("longitude", "latitude", "altitude")),
+        ("+proj=longlat +datum=WGS84 +no_defs", ("longitude", "latitude", "altitude")),
+        ("EPSG:32633", ("x", "y", "z")),
+        ("WGS84 UTM 33N", ("x", "y", "z")),
+    ],
+)
+@pytest.mark.parametrize("more", ["", " 0 0 0 0.02 0.05"])
+def test_columns_below_a_crs_are_an_image_and_its_place(tmp_path, crs, place, more):
+    """``geo.txt`` of OpenDroneMap."""
+    read = table(tmp_path, f"{crs}\n" + "".join(f"DJI_{k}.JPG 15.0{k} 47.8 500{more}\n" for k in range(3)))
+    assert read.header[:4] == ("image", *place)
+    assert read.text(0) == ["DJI_0.JPG", "DJI_1.JPG", "DJI_2.JPG"]
+    np.testing.assert_array_equal(read.values([1]).T, [[15.00, 15.01, 15.02]])
+
+
+def test_the_first_row_of_a_table_without_names_may_begin_with_one(tmp_path):
+    read = table(tmp_path, "a.png 1.0 2.0 3.0\nb.png 4.0 5.0 6.0\n")
+    assert (read.header, read.text(0)) == ((), ["a.png", "b.png"])
+
+
 def test_names_in_brackets_are_no_json(tmp_path):
     assert table(tmp_path, "[s] [m]\n1 2\n").header == ("[s]", "[m]")
 

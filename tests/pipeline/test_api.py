@@ -66,6 +66,8 @@ def test_terrain_and_trajectory_have_coordinates_and_units(run: rille.Run) -> No
     assert set(terrain.elevation.dims) == {"x", "y"}
     assert terrain.elevation.units == terrain.x.units == terrain.y.units == "m"
     assert terrain.cell_size_m == pytest.approx(0.004)
+    assert float(terrain.elevation.median()) == np.nanmedian(terrain.elevation)
+    assert terrain.chunk().elevation.chunks
     here = float(terrain.elevation.sel(x=0.0, y=0.5, method="nearest"))
     assert -0.25 < here < -0.11, "the camera stands 0.18 m above the bed"
     trajectory = run.trajectory

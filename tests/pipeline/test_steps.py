@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
@@ -50,6 +51,17 @@ def test_a_pair_is_the_same_in_another_process(pair: rille.StereoPair) -> None:
     there = pickle.loads(pickle.dumps(pair))
     assert (there.frame, there.sequence.source.opened) == (pair.frame, pair.sequence.source.opened)
     np.testing.assert_array_equal(there.left, pair.left)
+
+
+def test_a_sequence_is_the_same_from_another_folder(pair: rille.StereoPair, tmp_path: Path, monkeypatch: Any) -> None:
+    for side in ("left", "right"):
+        (tmp_path / "here" / side).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "here" / side / "000.png"), np.asarray(getattr(pair, side)))
+    (tmp_path / "here/calib.txt").write_text("300 0 142 0 0 300 129 0 0 0 1 0\n300 0 142 -29 0 300 129 0 0 0 1 0\n")
+    monkeypatch.chdir(tmp_path)
+    there = pickle.dumps(rille.open("here"))
+    monkeypatch.chdir("/")
+    np.testing.assert_array_equal(pickle.loads(there)[0].left, pair.left)
 
 
 def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: Any, dem: Any, tmp_path: Path) -> None:

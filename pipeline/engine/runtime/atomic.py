@@ -10,7 +10,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 LEFTOVER = ".tmp-"
@@ -58,9 +58,10 @@ def write(path: Path, data: bytes | str) -> None:
     try:
         with named(path):
             temporary.write_bytes(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
-        os.replace(temporary, path)
+            os.replace(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # it may not be there; what goes wrong first is said
+            temporary.unlink()
 
 
 def create(path: Path, content: bytes | memoryview) -> bool:
@@ -79,7 +80,8 @@ def create(path: Path, content: bytes | memoryview) -> bool:
         except FileExistsError:
             return False
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
     # Folders are not flushed, which takes as long again: a power failure may take back the last artifacts, each as a
     # whole, and they are computed again.
     return True

@@ -56,6 +56,25 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
     assert (by_write.value.filename, by_block.value.filename) == (str(tmp_path / "a"), str(tmp_path / "b"))
 
 
+def test_a_write_protected_disk_is_told_with_the_name_of_the_file(tmp_path, monkeypatch):
+    """Which refuses to remove a file before it looks whether there is one."""
+
+    def refused(path, *_, **__):
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    with pytest.raises(OSError, match="Read-only") as error:
+        atomic.write(tmp_path / "mask.png", b"")
+    assert error.value.filename == str(tmp_path / "mask.png")
+
+
+def test_what_stands_in_the_place_of_a_file_is_named(tmp_path):
+    with pytest.raises(IsADirectoryError) as error:
+        atomic.write(tmp_path, b"")
+    assert error.value.filename == str(tmp_path)
+
+
 def test_of_two_that_create_a_file_one_does(tmp_path):
     path = tmp_path / "a" / "b"
     assert atomic.create(path, b"one")

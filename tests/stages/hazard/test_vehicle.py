@@ -22,3 +22,10 @@ def test_a_belly_lower_than_the_step_is_refused() -> None:
 def test_nonsense_is_refused(bad: dict) -> None:
     with pytest.raises(ValidationError):
         Vehicle(**bad)
+
+
+@pytest.mark.parametrize("bad", [{"wheel_base": 1e-6}, {"wheel_base": 700}, {"track": 600}])
+def test_lengths_in_unlike_units_are_refused(bad: dict[str, float]) -> None:
+    """With the default of the other one; a vehicle as short as a millionth of its width took minutes to place."""
+    with pytest.raises(ValueError, match="give both in metres"):
+        Vehicle(**bad)
