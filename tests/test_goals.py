@@ -63,6 +63,10 @@ def test_street(data_dir: Path, tmp_path: Path) -> None:
     knocked = metrics(street, tmp_path, "misalign.rows=3", "misalign.roll_deg=0.3", "crosscheck.enabled=false")
     assert knocked["trajectory_drift"] <= 1.5 * m["trajectory_drift"]
     assert knocked["rig_residual"] < 0.25 * knocked["rig_residual_given"]
+    aside = ("misalign.yaw_deg=0.3", "misalign.since=12", "crosscheck.enabled=false")
+    later = metrics(street, tmp_path, *aside, complete=False)
+    assert later["frames_posed"] == 51
+    assert later["trajectory_drift"] <= 1.1 * m["trajectory_drift"]
 
 
 @pytest.mark.data

@@ -32,12 +32,14 @@ class MisalignParams(Params):
     roll_deg : clockwise turn of the right image [degrees].
     pitch_deg : turn about the right camera's x axis [degrees]; the image's contents move up.
     yaw_deg : turn about the right camera's y axis [degrees]; the image's contents move right.
+    since : number of the first frame behind the knock.
     """
 
     rows: float = Field(0.0, ge=-200, le=200)
     roll_deg: float = Field(0.0, ge=-45, le=45)
     pitch_deg: float = Field(0.0, ge=-20, le=20)
     yaw_deg: float = Field(0.0, ge=-20, le=20)
+    since: int = Field(0, ge=0)
 
     @property
     def none(self) -> bool:
@@ -48,7 +50,8 @@ class MisalignParams(Params):
         """Change of the right images, in words."""
         turns = f"{self.roll_deg:g} degrees of roll, {self.pitch_deg:g} of pitch, {self.yaw_deg:g} of yaw"
         moved = f"{self.rows:g} px in the row, {turns}"
-        return f"right images are misaligned on purpose: {moved}; the given rig does not say so"
+        since = f" from frame {self.since} on" if self.since else ""
+        return f"right images are misaligned on purpose{since}: {moved}; the given rig does not say so"
 
 
 def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
@@ -68,7 +71,7 @@ def misalign(sequence: Sequence, params: MisalignParams) -> Sequence:
 
     def image(frame: int, camera: str) -> Source:
         source = sequence.image(frame, camera)
-        if camera != "right":
+        if camera != "right" or frame < params.since:
             return source
         args = {"frame": frame, "camera": camera, "lens": lens.to_dict()}
         return Source("rille.datasets.images.misalign", params, args, inputs={"image": source})

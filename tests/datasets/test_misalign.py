@@ -113,6 +113,9 @@ def test_only_the_right_images_change():
 def test_nothing_asked_is_the_same_sequence():
     plain = mockup(MockupParams(**SHORT))
     assert misalign(plain, MisalignParams()) is plain
+    later = misalign(plain, MisalignParams(yaw_deg=0.3, since=5))
+    assert [later.image(frame, "right") == plain.image(frame, "right") for frame in (4, 5)] == [True, False]
+    assert "on purpose from frame 5 on: " in later.notes[-1]
 
 
 def test_real_optics_are_used_where_there_are_any():
