@@ -8,13 +8,13 @@ errors of the relative pose, and because a bad view must show in its own residua
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
-import scipy
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
@@ -22,6 +22,7 @@ from rille.stages.geometry.epipolar import distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import COEFFICIENTS, Lens
 from rille.stages.geometry.rigid import angle
+from rille.stages.numeric.least_squares import NormalEquations, levenberg_marquardt
 
 MODELS: Mapping[str, tuple[str, ...]] = {name: keys for name, keys in COEFFICIENTS.items() if keys} | {
     "radtan4": COEFFICIENTS["radtan"][:4]
@@ -258,6 +259,21 @@ class Adjustment:
             by_lens, by_pose = j[:, 6 : 10 + d.size], j[:, :6]
         return points.reshape(-1) - found.reshape(-1), by_lens, by_pose
 
+    def normal(self, x: Floats) -> NormalEquations:
+        """Normal equations; the cost is in pixels squared, infinite if a corner has no image."""
+        residual, jacobian = self.evaluate(x)
+        # Squared residual of each corner over the scale of the loss.
+        squares = (residual.reshape(-1, 2) ** 2).sum(1) / CORNER_SCALE**2
+        weight = np.repeat(1.0 / (1.0 + squares), 2) if self.robust else np.ones(residual.size)
+        weighted = (jacobian * weight[:, None]).T
+        cost = CORNER_SCALE**2 * float((np.log1p(squares) if self.robust else squares).sum())
+        return NormalEquations(weighted @ jacobian, weighted @ residual, cost if math.isfinite(cost) else math.inf)
+
+    def ahead(self, x: Floats, normal: NormalEquations, damping: float) -> Floats:
+        """The unknowns after one damped step."""
+        damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
+        return np.asarray(x + np.linalg.lstsq(damped, -normal.gradient, rcond=None)[0])
+
     def solve(self, x: Floats) -> Floats:
         """The unknowns of least cost, starting from ``x``.
 
@@ -266,10 +282,7 @@ class Adjustment:
         DegenerateError
             The adjustment diverges.
         """
-        loss = {"loss": "cauchy", "f_scale": CORNER_SCALE} if self.robust else {}
-        x = scipy.optimize.least_squares(
-            lambda x: self.evaluate(x)[0], x, lambda x: self.evaluate(x)[1], x_scale="jac", ftol=1e-12, **loss
-        ).x
+        x = levenberg_marquardt(self, x, 100, 1e-10).state
         if not (np.isfinite(x).all() and min(x[0], x[1], x[self.lens], x[self.lens + 1]) > 0):
             raise DegenerateError("RIL-312", "the adjustment of the cameras diverges", remedy=MORE_VIEWS)
         return x
