@@ -93,7 +93,8 @@ def named(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not error.filename or LEFTOVER in str(error.filename):
+        # Without a number its words would be lost.
+        if error.errno is not None and (not error.filename or LEFTOVER in str(error.filename)):
             error.filename = str(path)
         raise
 

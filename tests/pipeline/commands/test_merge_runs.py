@@ -112,5 +112,5 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
     with raises("RIL-607"):
         merge(str(a), str(b), output=coarse)
     (tmp_path / "file").write_text("")
-    with pytest.raises(FileExistsError, match="file"):
+    with raises("RIL-607", "file exists"):
         merge(str(a), str(made_run(tmp_path / "c", SECOND)), output=tmp_path / "file")
