@@ -93,6 +93,8 @@ READ_BY = {
     **{parameter: {"image/right"} for parameter in SOURCES if parameter.startswith("misalign.")},
 }
 """Parameters of a sequence that few tasks get, directly or as an argument."""
+BESIDE = {"misalign.since": {"yaw_deg": 1.0}}
+"""Others of the same section without which a parameter changes nothing."""
 
 
 @pytest.mark.parametrize("parameter", SOURCES)
@@ -102,7 +104,7 @@ def test_a_parameter_of_the_sequence_makes_stale_exactly_what_gets_it(chain: Cha
     usual = SHORT.get(name, field.default) if section == "mockup" else field.default
     for value in (v for v in candidates(field.annotation, usual) if v != usual):
         with suppress(RilleError):
-            sequence = short({section: {name: value}})
+            sequence = short({section: {name: value} | BESIDE.get(parameter, {})})
             break
     graph = chain.plan({}, sequence)
     before = [described(h) for h in chain.base.nodes]
