@@ -17,6 +17,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
@@ -27,13 +28,11 @@ from rille.stages.hfvm import epipolar, plane, refinement, textureless
 from rille.stages.hfvm.coarse import Coarse
 from rille.stages.hfvm.image import Image, Layer, Shape, Window, thinned, whole
 from rille.stages.hfvm.level import (
-    FAILED_PX,
     MAX_FIT_MATCHES,
     NEAR_SIGN,
     Band,
     PyramidPair,
     State,
-    backmatch,
     fill_rows,
     hand_down,
     match_level,
@@ -45,6 +44,9 @@ from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.refinement import local_mean
 from rille.stages.numeric.windows import window_count, window_room
 
+FAILED_PX = np.float32(1e9)
+"""Back-matching error of pixels whose match is not a usable pixel of the right image."""
+
 CROWD_SIDE_PX = 9
 """Pixels: side of the neighbourhood in which matches support each other, about that of a feature window."""
 
@@ -52,16 +54,45 @@ NO_PATCH = -32768
 """Displacement of pixels that are in no patch."""
 
 
-def nearest(a: AnyArray, there: Map, border: int = cv2.BORDER_REPLICATE) -> AnyArray:
-    """Values (row, col) of ``a`` at the pixels nearest to where displacements lead; beyond it by ``border``."""
+@njit(cache=True, nogil=True)
+def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
+    """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
+
+    ``error`` comes as FAILED_PX and stays so outside the right image and on its masked pixels. The right map, columns
+    and rows of displacement, is read at the nearest pixel.
+    """
+    ru, rv = right
+    last_x, last_y, half = np.float32(ru.shape[1] - 1), np.float32(ru.shape[0] - 1), np.float32(0.5)
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
+            if not (xr >= 0 and xr <= last_x and yr >= 0 and yr <= last_y):
+                continue
+            # A half and truncation round to the nearest pixel, since neither is negative here.
+            i, j = np.int64(xr + half), np.int64(yr + half)
+            if right_valid[j, i]:
+                du, dv = u[y, x] + ru[j, i], v[y, x] + rv[j, i]
+                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED_PX)
+
+
+def nearest(a: AnyArray, there: Map) -> AnyArray:
+    """Values (row, col) of ``a`` at the pixels nearest to where displacements lead; of its border beyond it."""
     y, x = np.indices(there.u.shape, np.float32)
-    return np.asarray(cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=border))
+    return np.asarray(cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
 
 
-def lands(there: Map, keep: AnyArray, right_valid: AnyArray) -> NDArray[np.bool_]:
+@njit(cache=True, nogil=True)
+def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
     """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
-    # Half a pixel beyond the outermost centres is still on the image; beyond it the border is 0.
-    return np.asarray(keep & (nearest(right_valid, there, cv2.BORDER_CONSTANT) != 0))
+    landing, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)
+    rows, cols = right_valid.shape
+    for y in range(u.shape[0]):
+        for x in range(u.shape[1]):
+            # Half a pixel beyond the outermost centres is still on the image.
+            xr, yr = np.float32(x) + u[y, x] + half, np.float32(y) + v[y, x] + half
+            if keep[y, x] and 0 < xr < cols and 0 < yr < rows:
+                landing[y, x] = right_valid[np.int64(yr), np.int64(xr)] != 0
+    return landing
 
 
 def lonely(keep: AnyArray, share: float) -> NDArray[np.bool_]:
@@ -192,7 +223,8 @@ def reasons(
 
     ``there, back``: displacements of the ``layers``, (row, col) float32; ``deviation``: of the left one.
     """
-    error = backmatch(there, back, layers[1].valid)
+    error = np.full(distance.shape, FAILED_PX, np.float32)
+    backmatch(there.u, there.v, back, layers[1].valid, error)
     validity = np.zeros(error.shape, np.uint8)
     # A masked pixel is no part of the image, so it counts as outside.
     outside = (error >= FAILED_PX) | (layers[0].valid == 0)
@@ -239,7 +271,7 @@ def smooth(work: FinestWork, fine: Fine) -> Fine:
 
 def landing(work: FinestWork, fine: Fine) -> Fine:
     """Reject pixels whose match is not in the right image."""
-    there = lands(Map(*work.to_right(fine.u, fine.v)), fine.keep, work.right.valid)
+    there = lands(*work.to_right(fine.u, fine.v), fine.keep, work.right.valid)
     return replace(fine, validity=fine.against(fine.keep & ~there, Validity.OUT_OF_IMAGE))
 
 

@@ -67,9 +67,10 @@ def check(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams) -
     # Displacements of a level are 16-bit and doubled from level to level. NaN is not less, and so unknown as well.
     known = np.abs(column) < 16000
     u = np.where(known, column, 0.0).astype(np.float32)
+    zeros = np.zeros_like(u)
     there = Map(np.rint(u).astype(np.int16), np.zeros(u.shape, np.int16))
     a, b = as_matched(left, params), as_matched(right, params)
-    inside = lands(there, known, right.valid[0])
+    inside = lands(np.rint(u), zeros, known, right.valid[0])
     ratio = ratio_of_matches(a, b, State(0, there, there, inside, inside, FREE_BAND, NEAR_SIGN))
     if ratio is not None and greatest(ratio) > MIN_LOG_RATIO:
         b = levelled(b, ratio)

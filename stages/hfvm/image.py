@@ -12,7 +12,7 @@ variance enters as its square root, in grey levels like the other seven."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -107,47 +107,96 @@ def thinned(marked: AnyArray, most: int) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 Words = NDArray[np.uint64]
+Planes = NDArray[np.float32]
 
 HIGH_PASS = (2, 1, 0, -1, -2)
 BAND_PASS = (1, 0, -1, 0, 1, 0, -1)
 WIDE_BAND_PASS = (2, 1, 0, -1, -2, -1, 0, 1, 2, 1, 0, -1, -2)
 GAUSSIAN = ((0, 1, 2, 1, 0), (1, 3, 5, 3, 1), (2, 5, 8, 5, 2), (1, 3, 5, 3, 1), (0, 1, 2, 1, 0))
+RADIUS_PX = 6
+"""Pixels: reach of the widest kernel; images are completed by repeating their edge."""
+
+
+def _taps(kernel: Sequence[Sequence[int]], feature: int, norm: int) -> list[tuple[int, int, int, float]]:
+    """Number of the feature, rows and columns into the frame, and factor, of the pixels that a kernel adds up."""
+    rows, cols = (RADIUS_PX + len(side) // 2 for side in (kernel, kernel[0]))
+    # Turned around, since the table's are convolutions; the signs of the derivatives hang on it.
+    return [
+        (feature, rows - j, cols - i, factor / norm)
+        for j, line in enumerate(kernel)
+        for i, factor in enumerate(line)
+        if factor
+    ]
+
+
+TAPS = np.array(
+    [
+        tap
+        for k, (kernel, norm) in enumerate(((HIGH_PASS, 4), (BAND_PASS, 2), (WIDE_BAND_PASS, 8)))
+        for tap in (*_taps([kernel], 2 * k, norm), *_taps([[factor] for factor in kernel], 2 * k + 1, norm))
+    ]
+    + _taps(GAUSSIAN, 7, 56)
+)
+"""Table 1, over its divisors n: features 0 to 5, and 7. Feature 6 is the local variance, whose mean needs none."""
+
 DEVIATION = 6
 """Number of the feature that is the local standard deviation."""
 
 
-def planes(image: AnyArray) -> Iterator[Floats32]:
-    """Eight features of Table 1 (row, col), grey levels, divided by its normalisation; 6 is the standard deviation.
+def planes(image: AnyArray) -> Planes:
+    """Features of Table 1, each divided by its normalisation.
 
-    ``image`` (row, col): grey 0..255; completed by repeating its edge.
+    Parameters
+    ----------
+    image : (row, col) grey 0..255; completed by repeating its edge.
+
+    Returns
+    -------
+    (8, row, col) float32, grey levels; plane 6 is the standard deviation.
     """
-    grey = np.asarray(image, np.float32)
+    framed, out = _framed(image, RADIUS_PX), np.empty((8, *image.shape), np.float32)
+    for y in range(len(image)):
+        row_of_features(framed[y : y + 2 * RADIUS_PX + 1], TAPS, out[:, y])
+    return out
 
-    def convolved(kernel: AnyArray) -> Floats32:
-        # Turned around, since OpenCV's are no convolutions; the signs of the derivatives hang on it.
-        return np.asarray(cv2.filter2D(grey, cv2.CV_32F, kernel[::-1, ::-1], borderType=cv2.BORDER_REPLICATE))
 
-    for line, norm in ((HIGH_PASS, 4), (BAND_PASS, 2), (WIDE_BAND_PASS, 8)):
-        row = np.array([line]) / norm
-        yield convolved(row)
-        yield convolved(row.T)
+def _framed(image: AnyArray, wide: int) -> AnyArray:
+    """The image as float32 in a frame that repeats its edge."""
+    a = np.asarray(image, np.float32)
+    return np.asarray(cv2.copyMakeBorder(a, wide, wide, wide, wide, cv2.BORDER_REPLICATE))
+
+
+@njit(cache=True, nogil=True)
+def row_of_features(rows, taps, out):  # type: ignore[no-untyped-def]
+    """Features (8, col) of a row, from the 13 ``rows`` around it, whose frame they include."""
+    cols, middle = out.shape[1], np.float32(128.0)
+    out[:] = np.float32(0.0)
+    for t in range(len(taps)):
+        target, factor = out[np.int64(taps[t, 0])], np.float32(taps[t, 3])
+        source = rows[np.int64(taps[t, 1])][np.int64(taps[t, 2]) :]
+        for x in range(cols):
+            target[x] += factor * source[x]
     # The paper gives no window for the variance; 5 x 5 pixels are our choice.
-    yield np.sqrt(_moments(grey, 5)[2])
-    yield convolved(np.array(GAUSSIAN) / 56)
+    width, size = 5, np.float32(25.0)
+    first = RADIUS_PX - width // 2
+    sums, squares = np.zeros(cols + width - 1, np.float32), np.zeros(cols + width - 1, np.float32)
+    for k in range(first, first + width):
+        source = rows[k][first:]
+        for x in range(sums.size):
+            # From the middle of the range: the difference of squares below then loses fewer digits.
+            grey = source[x] - middle
+            sums[x] += grey
+            squares[x] += grey * grey
+    for x in range(cols):
+        total, square = np.float32(0.0), np.float32(0.0)
+        for k in range(width):
+            total += sums[x + k]
+            square += squares[x + k]
+        # Rounding may leave the variance of a flat window below zero.
+        out[DEVIATION, x] = np.sqrt(max(square / size - (total / size) * (total / size), np.float32(0.0)))
 
 
-def _moments(image: AnyArray, side: int) -> tuple[Floats32, Floats32, Floats32]:
-    """Grey values (row, col) less 128, and their means and variances over windows of ``side`` pixels.
-
-    From the middle of the range: the difference of squares then loses fewer digits. The image's edge is repeated.
-    """
-    grey = np.asarray(image, np.float32) - np.float32(128)
-    mean, square = (cv2.blur(a, (side, side), borderType=cv2.BORDER_REPLICATE) for a in (grey, grey * grey))
-    # Rounding may leave the variance of a flat window below zero.
-    return grey, mean, np.maximum(square - mean * mean, np.float32(0))
-
-
-def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Floats32]:
+def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, AnyArray]:
     """Fast features of one image.
 
     Parameters
@@ -160,24 +209,33 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, Floats32]:
     words : (row, col) uint64, byte l is feature l: 128 + round(2 w_l sign(f_l) sqrt|f_l|), clipped.
     deviation : (row, col) float32, local standard deviation, grey levels (feature 6).
     """
-    words, deviation = np.zeros(image.shape, np.uint64), np.zeros(0, np.float32)
-    for k, (plane, weight) in enumerate(zip(planes(image), weights, strict=True)):
-        # 2.0: byte steps per weighted unit: with the default weights of 4 the strongest edges just fill a byte.
-        _add_byte(plane, np.float32(2.0 * weight), k, words)
-        deviation = plane if k == DEVIATION else deviation
+    words, deviation = np.zeros(image.shape, np.uint64), np.empty(image.shape, np.float32)
+    # 2.0: byte steps per weighted unit: with the default weights of 4 the strongest edges just fill a byte.
+    scale = np.asarray(weights, np.float32) * np.float32(2.0)
+    _pack(_framed(image, RADIUS_PX), TAPS, scale, words, deviation)
     return words, deviation
 
 
 @njit(cache=True, nogil=True)
-def _add_byte(plane, scale, k, words):  # type: ignore[no-untyped-def]
-    """Set byte ``k`` of the words (row, col) to the signed square roots of a feature, times ``scale``."""
-    zero, top, shift = np.float32(0.0), np.float32(255.0), np.uint64(8 * k)
-    for y in range(plane.shape[0]):
-        for x in range(plane.shape[1]):
-            root = np.sqrt(abs(plane[y, x])) * scale
-            # 128 stands for zero, so that the sign fits into a byte; the half more makes truncation round.
-            byte = np.float32(128.5) + (root if plane[y, x] > zero else -root)
-            words[y, x] |= np.uint64(np.int32(min(max(byte, zero), top))) << shift
+def _pack(framed, taps, scale, words, deviation):  # type: ignore[no-untyped-def]
+    features = np.empty((8, words.shape[1]), np.float32)
+    for y in range(len(words)):
+        row_of_features(framed[y : y + 2 * RADIUS_PX + 1], taps, features)
+        line = words[y]
+        for k in range(8):
+            plane, factor, shift = features[k], scale[k], np.uint64(8 * k)
+            for x in range(line.size):
+                line[x] |= _byte(plane[x], factor) << shift
+        for x in range(line.size):
+            deviation[y, x] = features[DEVIATION, x]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _byte(value, scale):  # type: ignore[no-untyped-def]
+    root = np.sqrt(abs(value)) * scale
+    # 128 stands for zero, so that the sign fits into a byte; the half more makes truncation round.
+    byte = np.float32(128.5) + (root if value > np.float32(0.0) else -root)
+    return np.uint64(np.int32(min(max(byte, np.float32(0.0)), np.float32(255.0))))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -216,11 +274,21 @@ def compact(image: AnyArray) -> Words:
     -------
     (row, col) uint64, byte k is ``128 + round(8 sign(s) sqrt|s|)`` of the step s to neighbour k, clipped.
     """
-    (rows, cols), words = image.shape, np.zeros(image.shape, np.uint64)
-    framed = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    for k, (j, i) in enumerate(NEIGHBOURS):
-        _add_byte(framed[1 + j : 1 + j + rows, 1 + i : 1 + i + cols] - image, COMPACT_STEPS, k, words)
+    words = np.empty(image.shape, np.uint64)
+    _compact(_framed(image, 1), words)
     return words
+
+
+@njit(cache=True, nogil=True)
+def _compact(framed, words):  # type: ignore[no-untyped-def]
+    """Words of an image that has a frame of one pixel."""
+    for y in range(words.shape[0]):
+        for x in range(words.shape[1]):
+            word = np.uint64(0)
+            for k in range(len(NEIGHBOURS)):
+                step = framed[y + 1 + NEIGHBOURS[k][0], x + 1 + NEIGHBOURS[k][1]] - framed[y + 1, x + 1]
+                word |= _byte(step, COMPACT_STEPS) << np.uint64(8 * k)
+            words[y, x] = word
 
 
 Grey = tuple[AnyArray, AnyArray]
@@ -355,12 +423,29 @@ def lee(image: AnyArray, noise: float) -> Floats32:
     (J.-S. Lee (1980), Digital image enhancement and noise filtering by use of local statistics, IEEE Transactions on
     Pattern Analysis and Machine Intelligence 2, 165-168; there 2.5 is 1.)
     """
-    grey, mean, variance = _moments(image, 3)
-    # 1e-3: rounding error of the variance of a flat window, squared grey levels.
-    variance = np.maximum(variance, np.float32(1e-3))
+    out = np.empty(image.shape, np.float32)
     # The variance of nine pixels of white noise reaches 2.5 times its expectation in one of two hundred places; all
     # others are averaged alike. A texture of random dots, which looks like noise, then still matches where it is
     # shifted by a fraction of a pixel: .87 and more of it, with 1 as little as .07. Bad-2 of noisy pairs is alike from
     # 1 to 2.5.
-    gain = np.maximum(variance - np.float32(2.5 * noise * noise), np.float32(0)) / variance
-    return np.asarray(mean + gain * (grey - mean) + np.float32(128))
+    _lee(np.pad(image, 1, mode="edge"), np.float32(2.5 * noise * noise), out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _lee(image, excess, denoised):  # type: ignore[no-untyped-def]
+    middle, ninth, nil = np.float32(128.0), np.float32(1.0 / 9.0), np.float32(0.0)
+    # Rounding error of the variance of a flat window, squared grey levels.
+    least = np.float32(1e-3)
+    sums, squares = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.float32)
+    for y in range(denoised.shape[0]):
+        above, here, below, out = image[y], image[y + 1], image[y + 2], denoised[y]
+        for x in range(image.shape[1]):
+            # From the middle of the range: the difference of squares below then loses fewer digits.
+            a, b, c = above[x] - middle, here[x] - middle, below[x] - middle
+            sums[x], squares[x] = a + b + c, a * a + b * b + c * c
+        for x in range(denoised.shape[1]):
+            mean = (sums[x] + sums[x + 1] + sums[x + 2]) * ninth
+            variance = max((squares[x] + squares[x + 1] + squares[x + 2]) * ninth - mean * mean, least)
+            gain = max(variance - excess, nil) / variance
+            out[x] = (mean + gain * (here[x + 1] - middle - mean)) + middle

@@ -251,34 +251,22 @@ def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limi
 
     ``own, other``: maps, ``u`` and ``v`` int16.
     """
-    return np.asarray((backmatch(own, other, other_valid) <= limit) & (own_valid != 0))
-
-
-FAILED_PX = np.float32(1e9)
-"""Back-matching error of pixels whose match is not a usable pixel of the right image."""
+    agreeing = np.zeros(own.u.shape, bool)
+    _agree(own, other, own_valid, other_valid, np.float32(limit * limit), agreeing)
+    return agreeing
 
 
 @njit(cache=True, nogil=True)
-def backmatch(there, back, right_valid):  # type: ignore[no-untyped-def]
-    """Distance |l - l'| (row, col) of each left pixel after matching to the right and back (4.3.3), pixels.
-
-    :data:`FAILED_PX` outside the right image and on its masked pixels. The map of the way back is read at the nearest
-    pixel.
-    """
-    (u, v), (ru, rv) = there, back
-    error = np.full(u.shape, FAILED_PX, np.float32)
-    last_x, last_y, half = np.float32(ru.shape[1] - 1), np.float32(ru.shape[0] - 1), np.float32(0.5)
-    for y in range(u.shape[0]):
-        for x in range(u.shape[1]):
-            xr, yr = np.float32(x) + u[y, x], np.float32(y) + v[y, x]
-            if not (xr >= 0 and xr <= last_x and yr >= 0 and yr <= last_y):
-                continue
-            # A half and truncation round to the nearest pixel, since neither is negative here.
-            i, j = np.int64(xr + half), np.int64(yr + half)
-            if right_valid[j, i]:
-                du, dv = u[y, x] + ru[j, i], v[y, x] + rv[j, i]
-                error[y, x] = min(np.sqrt(du * du + dv * dv), FAILED_PX)
-    return error
+def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[no-untyped-def]
+    rows, cols = agreeing.shape
+    brows, bcols = np.uint64(other_valid.shape[0]), np.uint64(other_valid.shape[1])
+    for y in range(rows):
+        for x in range(cols):
+            # Unsigned: a negative index becomes greater than any column.
+            i, j = np.uint64(x + np.int64(own.u[y, x])), np.uint64(y + np.int64(own.v[y, x]))
+            if own_valid[y, x] and i < bcols and j < brows and other_valid[j, i]:
+                du, dv = np.int64(own.u[y, x]) + other.u[j, i], np.int64(own.v[y, x]) + other.v[j, i]
+                agreeing[y, x] = du * du + dv * dv <= most
 
 
 def one_way(images: PyramidPair, level: int, above: State | None, near_sign: float, fine_rounds: int) -> Map:

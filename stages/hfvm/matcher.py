@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numba import njit
 
 from rille.stages.core.declare import AnyArray
 from rille.stages.core.validity import Validity
@@ -77,9 +78,9 @@ def doubled(
     rest = ("validity", "backmatch_error", "distance", "disparity_std")
     double = partial(cv2.resize, dsize=None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     big = {name: double(arrays[name])[:rows, :cols] for name in rest}
-    u, v = (_doubled(arrays[name], valid.shape) for name in ("column_disparity", "row_disparity"))
-    x, y = np.arange(cols, dtype=np.float32) + first[0] + u, np.arange(rows, dtype=np.float32)[:, None] + first[1] + v
-    bits, inside = big["validity"], (x >= 0) & (x <= right[1] - 1) & (y >= 0) & (y <= right[0] - 1)
+    u, v, inside = np.empty(valid.shape, np.float32), np.empty(valid.shape, np.float32), np.empty(valid.shape, bool)
+    _doubled((arrays["column_disparity"], arrays["row_disparity"]), first, right, (u, v), inside)
+    bits = big["validity"]
     gone = (valid == 0) | (~inside & (bits & Validity.MATCHED != 0))
     unmatched = bits & ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED) | np.uint8(Validity.OUT_OF_IMAGE)
     np.copyto(bits, unmatched, where=gone)
@@ -90,21 +91,33 @@ def doubled(
     return {"column_disparity": u, "row_disparity": v, **big}
 
 
-def _doubled(a: AnyArray, shape: tuple[int, ...]) -> AnyArray:
-    """Displacements (row, col) twice as large at twice the resolution, cut to ``shape``, along their slopes."""
-    # From the middle of the four pixels half a pixel to either side.
-    below, beside = (np.where(np.arange(n) % 2, np.float32(0.5), np.float32(-0.5)) for n in shape)
-    whole, along, down = (
-        part.repeat(2, axis=0)[: shape[0]].repeat(2, axis=1)[:, : shape[1]] for part in (a, _slopes(a), _slopes(a.T).T)
-    )
-    return np.asarray(2 * whole + down * below[:, None] + along * beside)
+@njit(cache=True, nogil=True)
+def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
+    """Displacements twice as large, along their slopes, and whether they end in the right image."""
+    (rows, cols), half = inside.shape, np.float32(0.5)
+    for k in range(2):
+        along, down = _slopes(small[k]), _slopes(small[k].T).T
+        for y in range(rows):
+            # From the middle of the four pixels half a pixel to either side.
+            here, out, below = small[k][y // 2], big[k][y], half if y % 2 else -half
+            for x in range(cols):
+                beside = half if x % 2 else -half
+                out[x] = 2 * here[x // 2] + down[y // 2, x // 2] * below + along[y // 2, x // 2] * beside
+    u, v = big
+    for y in range(rows):
+        for x in range(cols):
+            xr, yr = np.float32(x + first[0]) + u[y, x], np.float32(y + first[1]) + v[y, x]
+            inside[y, x] = (xr >= 0) & (xr <= right[1] - 1) & (yr >= 0) & (yr <= right[0] - 1)
 
 
-def _slopes(a: AnyArray) -> AnyArray:
+@njit(cache=True, nogil=True)
+def _slopes(a):  # type: ignore[no-untyped-def]
     """Slopes (row, col) of displacements along their rows, where alike on both sides, within a pixel; else 0."""
-    out, steps = np.zeros(a.shape, np.float32), np.diff(a)
-    before, after = steps[:, :-1], steps[:, 1:]
-    np.multiply(before + after, np.float32(0.5), out=out[:, 1:-1], where=np.abs(before - after) <= 1)
+    out = np.zeros(a.shape, np.float32)
+    for y in range(a.shape[0]):
+        for x in range(1, a.shape[1] - 1):
+            before, after = a[y, x] - a[y, x - 1], a[y, x + 1] - a[y, x]
+            out[y, x] = np.float32(0.5) * (before + after) if abs(before - after) <= 1 else np.float32(0.0)
     return out
 
 

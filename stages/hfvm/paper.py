@@ -55,7 +55,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
         tell(1.0 - 0.25 ** (min(left.levels, right.levels) - n), f"level {n}")
         layers = [image.layers[n] for image in images]
         # 4.3.1: feature vectors, whose distance is Eq. 1
-        planes = [np.stack([*table_1(layer.grey)]) for layer in layers]
+        planes = [table_1(layer.grey) for layer in layers]
         vectors = [weighted(plane, params.weights) for plane in planes]
         # 4.3.4: both directions, median-filtered
         ways = [_one_way(vectors[k], vectors[1 - k], above[k], params) for k in (0, 1)]

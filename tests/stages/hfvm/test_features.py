@@ -24,10 +24,6 @@ def table_1(a):
     return np.stack(both)
 
 
-def planes(a):
-    return np.stack(list(images.planes(a)))
-
-
 def unpack(words):
     return np.moveaxis(words.view(np.uint8).reshape(*words.shape, 8), -1, 0)
 
@@ -41,12 +37,12 @@ def test_kernels_are_those_of_the_table():
 
 def test_planes_against_scipy():
     # float32 sums of at most 25 values below 255: 1e-3 is ten times their rounding.
-    np.testing.assert_allclose(planes(image()), table_1(image()), atol=1e-3)
+    np.testing.assert_allclose(images.planes(image()), table_1(image()), atol=1e-3)
 
 
 def test_high_pass_of_a_ramp_by_hand():
     ramp = np.tile(np.arange(20, dtype=np.float32), (20, 1))
-    found = planes(ramp)[:, 10, 10]
+    found = images.planes(ramp)[:, 10, 10]
     # convolution turns (2 1 0 -1 -2) over: 2*2 + 1 + 1 + 2*2 = 10 grey levels for slope one, over 4
     assert found[0] == 2.5
     assert found[1] == 0
@@ -70,9 +66,9 @@ def test_flat_image_has_the_middle_byte_and_no_deviation():
 
 def test_mirrored_image_mirrors_the_row_features():
     a = image()
-    mirrored = planes(a[:, ::-1])[:, :, ::-1]
-    np.testing.assert_allclose(mirrored[[0, 2, 4]], -planes(a)[[0, 2, 4]], atol=1e-4)
-    np.testing.assert_allclose(mirrored[[1, 3, 5, 6, 7]], planes(a)[[1, 3, 5, 6, 7]], atol=1e-3)
+    mirrored = images.planes(a[:, ::-1])[:, :, ::-1]
+    np.testing.assert_allclose(mirrored[[0, 2, 4]], -images.planes(a)[[0, 2, 4]], atol=1e-4)
+    np.testing.assert_allclose(mirrored[[1, 3, 5, 6, 7]], images.planes(a)[[1, 3, 5, 6, 7]], atol=1e-3)
 
 
 def test_distance_of_words_is_the_sum_of_absolute_byte_differences():

@@ -12,10 +12,10 @@ from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import epipolar, level, paper, plane, refinement
-from rille.stages.hfvm.finest import Ending, Fine, FinestWork, complete, isolated, speckles
+from rille.stages.hfvm.finest import FAILED_PX, Ending, Fine, FinestWork, backmatch, complete, isolated, speckles
 from rille.stages.hfvm.image import Window, as_matched
 from rille.stages.hfvm.image import planes as table_1
-from rille.stages.hfvm.level import FAILED_PX, Map, PyramidPair, Recipe, agree, backmatch
+from rille.stages.hfvm.level import Map, PyramidPair, Recipe, agree
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 from rille.stages.imaging.pyramid import PyramidParams, build
@@ -41,8 +41,10 @@ def learn(offsets):
 
 class TestConsistency:
     def backmatch(self, lu, lv, ru, rv, valid=None):
+        error = np.full(lu.shape, FAILED_PX, np.float32)
         valid = np.ones(ru.shape, np.uint8) if valid is None else valid
-        return backmatch(Map(lu, lv), Map(ru, rv), valid)
+        backmatch(lu, lv, (ru, rv), valid, error)
+        return error
 
     def test_by_hand(self):
         lu, lv, ru, rv = zeros(1, 4), zeros(1, 4), zeros(1, 4), zeros(1, 4)
@@ -364,7 +366,7 @@ class TestLookup:
         grey = (grey - grey.mean()) / grey.std() * 40 + 128
         moved = ndimage.map_coordinates(grey, [y, x - 2.5 - (x - 256) * 0.012 - (y - 128) * 0.004], mode="nearest")
         images = [(a + rng.normal(0, 1, a.shape)).clip(0, 255)[16:-16, 32:-32] for a in (grey, moved)]
-        planes = [np.stack([*table_1(image.astype(np.float32))]) for image in images]
+        planes = [table_1(image.astype(np.float32)) for image in images]
         vectors = [paper.weighted(plane, p.weights) for plane in planes]
         ways = (paper._one_way(*way, None, p) for way in (vectors, vectors[::-1]))
         maps = [Map(cv2.medianBlur(way.u, 3), cv2.medianBlur(way.v, 3)) for way in ways]
