@@ -250,22 +250,23 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
         return {}
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
-    use, off, shown = segment.inlier[:, -1] != 0, [], []
+    use, off, depth = segment.inlier[:, -1] != 0, [], []
     side = 1 if epipolar.standing(then) else 0
     for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
         disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
         at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)
         right = rig.right.project(rig.T_right_left.apply(at))
-        shown.append(right - rig.left.project(at))
+        depth.append(at[:, 2])
         use &= matched
-        error = disparity - shown[-1]
+        error = disparity - (right - rig.left.project(at))
         # A turn of the camera moves what is aside farther than what is in the middle.
         error[:, side] /= 1.0 + rig.right.rays(right)[:, side] ** 2
         off.append(error)
     if use.sum() < MIN_LANDMARKS:
         return {}
     departs = (off[1][use] - off[0][use]) / unit
-    grows = np.linalg.norm(shown[1][use], axis=1) / np.linalg.norm(shown[0][use], axis=1) - 1.0
+    # Of disparities beyond those at infinity, whatever the angles of the cameras.
+    grows = depth[0][use] / depth[1][use] - 1.0
     jump = jump_of(departs, grows)
     torn = float((np.linalg.norm(departs - np.median(departs, axis=0), axis=1) > 2 * MIN_JUMP_PX).mean())
     # 0.25: of the landmarks; fewer are left of a wide turn, at the rim of the view, where disparities are worst.
