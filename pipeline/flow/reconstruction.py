@@ -51,7 +51,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -186,13 +186,13 @@ def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
 class Tracked:
     """Basic pairs that fit each other, with their disparities (``matched``) and the tracks from each to the next.
 
-    ``moved``: pairs after a knock of the rig.
+    ``moved``: pairs after a knock of the rig that is not followed.
     """
 
     choice: Choice
     matched: dict[int, BasicPair]
     segments: list[Segment]
-    moved: set[int]
+    moved: Collection[int]
 
 
 def tracked(
@@ -223,26 +223,28 @@ def tracked(
         # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
         runs = [[choice.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
         segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
-        segments, moved, knock = yield from refuse_knocked(make, matched, segments)
-        p.resections = [s.resection for s in segments]
-        wanted = suspects(segments, choice.chain) if torn is None else confirmed(segments, choice.chain, torn)
+        moved = yield from behind_knocks(make, matched, segments)
+        # A knock leaves another rig than the one given.
+        sound = [s for s in segments if s.frames[0] not in moved]
+        wanted = suspects(sound, choice.chain) if torn is None else confirmed(sound, choice.chain, torn)
         if wanted != (torn or {}):
             torn = wanted
             make.discard(since)
             continue
         key = matched[choice.basic[0]]
-        # A knock leaves another rig than the one given.
-        sound = [s.resection for s in segments if s.frames[0] not in moved]
         judged = sound and make.config.resect.joint
-        correction = (yield from corrected_calibration(make, key, sound)) if judged else None
-        if correction is None and knock.keys() - knocks.keys() and len(knocks) < MAX_KNOCKS:
-            knocks |= knock
+        correction = (yield from corrected_calibration(make, key, [s.resection for s in sound])) if judged else None
+        first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(knocks) < MAX_KNOCKS
+        if correction is None and followed and first is not None and first not in knocks:
+            knocks[first] = moved[first]
             make.discard(since)
             continue
         if correction is None or attempt == MAX_CALIBRATIONS:
             if p.intrinsics is not None:
                 p.contradictions.append(p.intrinsics)
-            return Tracked(choice, matched, segments, moved)
+            segments = refused_behind(make, matched, segments, moved)
+            p.resections = [s.resection for s in segments]
+            return Tracked(choice, matched, segments, moved.keys())
         make.recalibrate(correction["corrected"], since)
         attempt += 1
 
@@ -558,28 +560,34 @@ def after_knocks(
     return out
 
 
-def refuse_knocked(
+def behind_knocks(
     make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment]
-) -> Generator[Wait, Any, tuple[list[Segment], set[int], dict[int, ResectFacts]]]:
-    """Refuse segments after a knock of the rig; return all segments, the basic pairs after the knock, and by its pair
-    the facts of the first one, unless the rig is fixed.
+) -> Generator[Wait, Any, dict[int, ResectFacts]]:
+    """Basic pairs after a knock of the rig, in order, each with the facts of the segment that shows the last knock.
 
     The rig was knocked if a basic pair measures other disparities than the first pair, which stands for the
     calibration made before the drive.
     """
-    p, by, cause = make.products, np.zeros(2), ""
-    out, moved, first = [], set[int](), dict[int, ResectFacts]()
+    moved, by, last = dict[int, ResectFacts](), np.zeros(2), None
     judged = yield Maybe([s.resection for s in segments])
     for s, one in zip(segments, judged, strict=True):
-        k, end = s.frames[0], s.frames[-1]
-        out.append(make.segment(s.frames, pairs[k], f"{k}/refused", refused=cause) if k in moved else s)
         if one is not None and "jump" in one.meta:
-            by, cause = by + one.meta["jump"], one.meta["knocked"]
-            first = first or {end: one.meta}
-            p.contradictions.append(s.resection)
-        if end in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
-            moved.add(end)
-    return out, moved, first if make.config.rig.mode != "fixed" else {}
+            by, last = by + one.meta["jump"], one.meta
+            make.products.contradictions.append(s.resection)
+        if last is not None and s.frames[-1] in pairs and np.linalg.norm(by) > MIN_JUMP_PX:
+            moved[s.frames[-1]] = last
+    return moved
+
+
+def refused_behind(
+    make: Builder, pairs: Mapping[int, BasicPair], segments: list[Segment], moved: Mapping[int, ResectFacts]
+) -> list[Segment]:
+    """All segments; those after a knock (``moved``) that is not followed give no pose."""
+
+    def refused(k: int, frames: Series[int]) -> Segment:
+        return make.segment(frames, pairs[k], f"{k}/refused", refused=moved[k]["knocked"])
+
+    return [refused(s.frames[0], s.frames) if s.frames[0] in moved else s for s in segments]
 
 
 def step_measures(make: Builder, chosen: Ref[KeyframesFacts]) -> list[list[float | None]]:

@@ -20,10 +20,9 @@ from rille.stages.geometry.scale import right_pixels
 def turned(rig: Rig, jump: Sequence[float]) -> tuple[Rig, float]:
     """Rig whose disparities of what is far ahead are others by a ``jump`` (column, row), px of the coarser image; and
     the angle, rad, by which its right camera is turned for that."""
-    far, one = np.array([0.0, 0.0, 1e3 * rig.baseline]), np.zeros(5)
+    one = np.zeros(5)
     one[epipolar.NAMES.index(epipolar.angle_along(rig))] = 1e-4  # rad, small enough for a derivative
-    before, after = (r.right.project(r.T_right_left.apply(far)) for r in (rig, epipolar.corrected(rig, one)))
-    slope = (after - before) / right_pixels(rig)
+    slope = epipolar.far_shift(rig, epipolar.corrected(rig, one)) / right_pixels(rig)
     share = float(slope @ jump / (slope @ slope))
     return epipolar.corrected(rig, share * one), share * float(one.sum())
 

@@ -51,6 +51,13 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
     return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
 
 
+def far_shift(rig: Rig, changed: Rig) -> Floats:
+    """Pixels (2,) by which a point far ahead moves in the right image if the rig is ``changed``."""
+    far = np.array([0.0, 0.0, 1e3 * rig.baseline])
+    before, after = (one.right.project(one.T_right_left.apply(far)) for one in (rig, changed))
+    return np.asarray(after - before)
+
+
 def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
     """Signed distances (n,) from the epipolar lines, pixels, and their derivatives (n, 7).
 

@@ -106,9 +106,8 @@ def corrected_rig(
 
 def toed_in(rig: Rig, angle: float) -> Rig:
     """Rig whose right camera has a yaw, rad, that its principal point takes back for what is far ahead."""
-    turned, far = corrected_rig(rig, np.zeros(CORRECTED), angle), np.array([0.0, 0.0, 100.0 * rig.baseline])
-    before, after = (one.right.project(one.T_right_left.apply(far)) for one in (rig, turned))
-    cx, cy = np.array([rig.right.cx, rig.right.cy]) - (after - before)
+    turned = corrected_rig(rig, np.zeros(CORRECTED), angle)
+    cx, cy = np.array([rig.right.cx, rig.right.cy]) - epipolar.far_shift(rig, turned)
     return replace(turned, right=replace(turned.right, cx=cx, cy=cy))
 
 

@@ -26,7 +26,7 @@ from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.facts.calibration import CalibrationFacts
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts
 from rille.stages.geometry import epipolar
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.odometry.resection.calibration_errors import (
     CORRECTED,
@@ -36,7 +36,6 @@ from rille.stages.odometry.resection.calibration_errors import (
     corrected_rig,
     deviations,
 )
-from rille.stages.odometry.resection.landmarks import triangulated
 
 MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
 """Segments that turn, below which the prior of the cameras' numbers decides; and segments that have to agree on a yaw
@@ -151,14 +150,10 @@ def alone(shown: Floats, least: float, *, change: bool = False) -> tuple[CommonE
 
 def px_per_yaw(rig: Rig) -> float:
     """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it."""
-    far = np.array([[0.0, 0.0, 100.0 * rig.baseline]])
-    left, right = rig.left.project(far), rig.right.project(rig.T_right_left.apply(far))
-    before, after = (
-        triangulated(left, right, one, RigidTransform.identity(), np.ones(1))
-        for one in (rig, corrected_rig(rig, np.zeros(CORRECTED), STEP))
-    )
-    along = (after.position - before.position) * before.per_pixel
-    return float(along.sum() / (before.per_pixel**2).sum()) / STEP
+    shift = epipolar.far_shift(rig, corrected_rig(rig, np.zeros(CORRECTED), STEP))
+    # Towards the right camera's side points are farther; what a changed rig adds there the same pixels lack.
+    farther = rig.centre[:2] / np.linalg.norm(rig.centre[:2])
+    return -float(shift @ farther) / STEP
 
 
 def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
