@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.kernel import kernel
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def _to_grid(xyz: Floats, x0: float, y0: float, cell: float) -> Floats:
     return np.stack([(xyz[:, 0] - x0) / cell, (y0 - xyz[:, 1]) / cell, xyz[:, 2]], axis=1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
     """Ray parameters (n,) in grid coordinates (column, row, metres), see :meth:`HeightField.contact`."""
     maxima, offsets, widths = pyramid

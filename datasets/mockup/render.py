@@ -22,6 +22,7 @@ from rille.datasets.mockup.scene import ALBEDO_LEVELS, height_field
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Memory, stage
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 MCEWEN_L = 0.6
@@ -62,7 +63,7 @@ class _Bed(NamedTuple):
     sun: Floats
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ignore[no-untyped-def]
     """Radiance (n,) of the hit points, NaN for rays without one; ``albedo``: its levels, the finest first."""
     height, cell, sun = bed.height, bed.cell, bed.sun
@@ -126,7 +127,7 @@ def _bilinear(a, r, c):  # type: ignore[no-untyped-def]
     return (1.0 - u) * top + u * ((1.0 - v) * a[i + 1, j] + v * a[i + 1, j + 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _texel(albedo, level, r, c):  # type: ignore[no-untyped-def]
     """Bilinear value of one level of the albedo at (row, column) of level 0."""
     size = float(1 << level)

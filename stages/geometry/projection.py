@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
 from rille.stages.core.arrays import Floats
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.geometry import Camera
 
 NEAREST_M = 1e-6
@@ -40,7 +40,7 @@ def perturbed(R: Floats, t: Floats, step: Floats) -> tuple[Floats, Floats]:
     return turn @ R, np.einsum("nij,nj->ni", turn, t) + step[:, :3]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rotated(R, v):  # type: ignore[no-untyped-def]
     """``R v`` as three numbers."""
     return (
@@ -61,7 +61,7 @@ def product(m, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def linearise(camera, x, along, pixel, j):  # type: ignore[no-untyped-def]
     """Fill ``j`` (2, 8): derivatives of a projection by ``v`` and ``w`` (6), by a shift ``along``; and its error.
 

@@ -10,10 +10,10 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Floats32
+from rille.stages.core.kernel import kernel
 
 TAPS_RADIUS_PX = 10
 """Pixels to either side that a coefficient depends on; the cut changes about a thousandth of a grey level."""
@@ -33,7 +33,7 @@ def coefficients(image: ArrayLike) -> Floats32:
     return np.asarray(cv2.sepFilter2D(grey, cv2.CV_32F, TAPS, TAPS, borderType=cv2.BORDER_REFLECT_101))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weights(t):  # type: ignore[no-untyped-def]
     """Weights of the coefficients at -1, 0, 1, 2 for a point at ``t``, 0..1; float32."""
     q, four, three, two, sixth = np.float32(1) - t, np.float32(4), np.float32(3), np.float32(2), np.float32(1 / 6)
@@ -41,14 +41,14 @@ def weights(t):  # type: ignore[no-untyped-def]
     return q * q * q * sixth, second * sixth, third * sixth, t * t * t * sixth
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def slopes(t):  # type: ignore[no-untyped-def]
     """Derivatives of :func:`weights`."""
     q, half, three, four = np.float32(1) - t, np.float32(0.5), np.float32(3), np.float32(4)
     return -half * q * q, half * t * (three * t - four), -half * q * (three * q - four), half * t * t
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def value_and_gradient(spline, x, y):  # type: ignore[no-untyped-def]
     """Value of a spline, by its coefficients (row, col), at a point, and its derivatives along x and y; float32.
 

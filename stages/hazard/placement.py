@@ -22,10 +22,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats, Floats32
+from rille.stages.core.kernel import kernel
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.numeric.extrema import running_max
 
@@ -145,7 +145,7 @@ class _Ground(NamedTuple):
     gaps_below: NDArray[np.uint16]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place(ground, stance, out):  # type: ignore[no-untyped-def]
     """Fill ``out``, tilt and slope squared, row by row: a row of a padded map, moved by an offset of ``stance``, is the
     ground below one part of the vehicle at all positions of the row."""
@@ -168,7 +168,7 @@ def _place(ground, stance, out):  # type: ignore[no-untyped-def]
         out.unstood[r] = missing / np.float32(parts)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _below_wheels(a, wheels, r, cols):  # type: ignore[no-untyped-def]
     """Rows of a map below the four wheels at the positions of row ``r``."""
     return (
@@ -179,7 +179,7 @@ def _below_wheels(a, wheels, r, cols):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the greatest squared gradient of the planes through three wheels on known ground."""
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -192,7 +192,7 @@ def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
         out[c] = max(out[c], along * along + across * across)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rise(wheels, belly, weights, out):  # type: ignore[no-untyped-def]
     """Raise ``out`` to the rise of a point of the belly, with these weights of the wheels, over the wheels' plane."""
     (fl, fr, rl, rr), zero = wheels, np.float32(0.0)

@@ -14,11 +14,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.projection import product
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
@@ -147,7 +147,7 @@ def moved(f: Matrix, left: tuple[float, float], right: tuple[float, float]) -> M
     return np.asarray(to_right.T @ f @ to_left, dtype=np.float64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def row_terms(f, y):  # type: ignore[no-untyped-def]
     """Lines of a row as polynomials of the column: seven float32, see :func:`line`.
 
@@ -158,7 +158,7 @@ def row_terms(f, y):  # type: ignore[no-untyped-def]
     return np.array([a, f[0, 0], b, f[1, 0], c, f[2, 0] + a + f[1, 0] * y, f[0, 0]]).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def line(terms, x, length):  # type: ignore[no-untyped-def]
     """Normal of ``length`` and offset (a, b, c) of the epipolar line of column ``x``; zeros where there is no band.
 
@@ -197,7 +197,7 @@ def oriented(f: Matrix, shape: tuple[int, ...]) -> Matrix:
     return f if (b if along_rows(f, shape) else -a) > 0 else -f
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def settled(f, u, v, wanted):  # type: ignore[no-untyped-def]
     """Row displacements (row, col), those of the ``wanted`` pixels by their column displacements and their lines.
 

@@ -17,10 +17,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.core.validity import Validity, mark
 from rille.stages.geometry import spline
 from rille.stages.geometry.scale import effective
@@ -54,7 +54,7 @@ NO_PATCH = -32768
 """Displacement of pixels that are in no patch."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def backmatch(u, v, right, right_valid, error):  # type: ignore[no-untyped-def]
     """Distance |l - l'| of each left pixel after matching to the right and back (4.3.3), pixels.
 
@@ -81,7 +81,7 @@ def nearest(a: AnyArray, there: Map) -> AnyArray:
     return np.asarray(cv2.remap(a, x + there.u, y + there.v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lands(u, v, keep, right_valid):  # type: ignore[no-untyped-def]
     """Pixels (bool) of ``keep`` whose displacement ends on a usable pixel of the right image."""
     landing, half = np.zeros(keep.shape, np.bool_), np.float32(0.5)

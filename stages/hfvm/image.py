@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.hfvm.params import HfvmParams, Weights
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
@@ -166,7 +167,7 @@ def _framed(image: AnyArray, wide: int) -> AnyArray:
     return np.asarray(cv2.copyMakeBorder(a, wide, wide, wide, wide, cv2.BORDER_REPLICATE))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def row_of_features(rows, taps, out):  # type: ignore[no-untyped-def]
     """Features (8, col) of a row, from the 13 ``rows`` around it, whose frame they include."""
     cols, middle = out.shape[1], np.float32(128.0)
@@ -216,7 +217,7 @@ def pack(image: AnyArray, weights: tuple[float, ...]) -> tuple[Words, AnyArray]:
     return words, deviation
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pack(framed, taps, scale, words, deviation):  # type: ignore[no-untyped-def]
     features = np.empty((8, words.shape[1]), np.float32)
     for y in range(len(words)):
@@ -279,7 +280,7 @@ def compact(image: AnyArray) -> Words:
     return words
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compact(framed, words):  # type: ignore[no-untyped-def]
     """Words of an image that has a frame of one pixel."""
     for y in range(words.shape[0]):
@@ -312,8 +313,8 @@ class Layer:
         return Layer(read, shape, weights, whole(shape))
 
     def cut(self, window: Window) -> Layer:
-        """A window of the level."""
-        return replace(self, window=window)
+        """A window of the level; this one, with what is computed of it, if it is the same."""
+        return self if window == self.window else replace(self, window=window)
 
     def blurred(self, deviation: float) -> Layer:
         """The same blurred by a Gaussian of this ``deviation``, pixels; itself if it already is."""
@@ -432,7 +433,7 @@ def lee(image: AnyArray, noise: float) -> Floats32:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lee(image, excess, denoised):  # type: ignore[no-untyped-def]
     middle, ninth, nil = np.float32(128.0), np.float32(1.0 / 9.0), np.float32(0.0)
     # Rounding error of the variance of a flat window, squared grey levels.

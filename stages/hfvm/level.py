@@ -13,10 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import Image, Layer, thinned
 from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map, unpacked
@@ -27,7 +27,7 @@ from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.plane import Sample
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_rows(u, v, keep, reach, near_sign, filled):  # type: ignore[no-untyped-def]
     """Interpolate undefined disparities along rows, in place; ``filled`` is set to 1 at the interpolated pixels.
 
@@ -256,7 +256,7 @@ def agree(own: Any, other: Any, own_valid: AnyArray, other_valid: AnyArray, limi
     return agreeing
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _agree(own, other, own_valid, other_valid, most, agreeing):  # type: ignore[no-untyped-def]
     rows, cols = agreeing.shape
     brows, bcols = np.uint64(other_valid.shape[0]), np.uint64(other_valid.shape[1])

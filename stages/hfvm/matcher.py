@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.core.validity import Validity
 from rille.stages.hfvm import coarse, finest, level
 from rille.stages.hfvm.coarse import ImageDifference
@@ -91,7 +91,7 @@ def doubled(
     return {"column_disparity": u, "row_disparity": v, **big}
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
     """Displacements twice as large, along their slopes, and whether they end in the right image."""
     (rows, cols), half = inside.shape, np.float32(0.5)
@@ -110,7 +110,7 @@ def _doubled(small, first, right, big, inside):  # type: ignore[no-untyped-def]
             inside[y, x] = (xr >= 0) & (xr <= right[1] - 1) & (yr >= 0) & (yr <= right[0] - 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slopes(a):  # type: ignore[no-untyped-def]
     """Slopes (row, col) of displacements along their rows, where alike on both sides, within a pixel; else 0."""
     out = np.zeros(a.shape, np.float32)

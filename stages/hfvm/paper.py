@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.hfvm.finest import Ending, complete, reasons
 from rille.stages.hfvm.image import DEVIATION, as_given
 from rille.stages.hfvm.image import planes as table_1
@@ -100,7 +100,7 @@ def weighted(planes: AnyArray, weights: tuple[float, ...]) -> AnyArray:
     return np.ascontiguousarray(np.moveaxis(planes * w[:, None, None], 0, -1), dtype=np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _eq1(f, g):  # type: ignore[no-untyped-def]
     total = np.float32(0.0)
     for k in range(f.shape[0]):
@@ -109,7 +109,7 @@ def _eq1(f, g):  # type: ignore[no-untyped-def]
     return np.sqrt(total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(left, right, centre, reach):  # type: ignore[no-untyped-def]
     """Best match (:class:`IntegerMatches`) of every pixel in the search area around its centre (Eq. 2, Eq. 3).
 

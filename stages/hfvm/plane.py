@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.cubic import cubic
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm.epipolar import typical
@@ -92,9 +92,9 @@ def aligned(right: Image, h: Matrix, left: Image) -> Image:
 
 def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> Grey:
     source = _source(h, window, layer.shape)
-    grey, mask = layer.read(source)
+    part = layer.cut(source)
     # The kernel reads repeated edges, so that no pixel of a coarse level, which has few, is lost.
-    grey, mask = np.pad(grey, KERNEL_REACH_PX, mode="edge"), np.pad(mask, KERNEL_REACH_PX)
+    grey, mask = np.pad(part.grey, KERNEL_REACH_PX, mode="edge"), np.pad(part.valid, KERNEL_REACH_PX)
     image, valid = np.empty(window.shape, np.float32), np.empty(window.shape, np.uint8)
     there = translation(KERNEL_REACH_PX - source.x0, KERNEL_REACH_PX - source.y0)
     warp(grey, mask, there @ h @ translation(window.x0, window.y0), image, valid)
@@ -105,8 +105,7 @@ def _resampled(layer: Layer, h: Matrix, above: Layer | None, window: Window) -> 
         # The same for every window.
         return np.where(seen, image, layer.grey.mean()), valid
     outer = window.parent()
-    coarse, _ = above.read(outer)
-    return filled_from(coarse, image, seen, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), valid
+    return filled_from(above.cut(outer).grey, image, seen, window.y0 - 2 * outer.y0, window.x0 - 2 * outer.x0), valid
 
 
 def _source(h: Matrix, window: Window, shape: Shape) -> Window:
@@ -126,7 +125,7 @@ def to_original(h: Matrix, left_shape: Shape) -> Matrix:
     return h @ translation(-margin(left_shape))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def carried(g, u, v, x0=0, y0=0):  # type: ignore[no-untyped-def]
     """Displacements (row, col) float32 whose ends are those of ``u, v``, mapped by the homography ``g``.
 
@@ -243,7 +242,7 @@ def distortion(h: Matrix, shape: tuple[int, int]) -> float:
     return float(max(np.median(np.abs(d)) for d in parts))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def warp(image, valid, h, out, out_valid):  # type: ignore[no-untyped-def]
     """``out(x, y) = image(H (x, y))``, Catmull-Rom; ``out_valid`` 0 where that is outside or masked."""
     height, width = image.shape

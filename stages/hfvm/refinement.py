@@ -53,10 +53,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.spline import value_and_gradient
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import thinned
@@ -106,7 +106,11 @@ def refine(
     """
     now, rests, axes = start, list[AnyArray](), _axes(to_right, start)
     for _ in range(steps):
-        step_u, step_v, rest, per_noise = _window_steps(_warped(images, *to_right(*now), keep), axes, keep, upright)
+        planes = _warped(images, *to_right(*now), keep, WINDOW_RADIUS_PX)
+        if axes is not None:
+            gx, gy = (plane[_inner(plane, WINDOW_RADIUS_PX)] for plane in planes[1:3])
+            gx[:], gy[:] = gx * axes[0] + gy * axes[1], gx * axes[2] + gy * axes[3]
+        step_u, step_v, rest, per_noise = _window_steps(planes, keep, upright)
         rests.append(rest)
         now = local_mean(now[0] + step_u, now[1] + step_v, keep, 1, 1)
     # Residuals are those before a step: after a single one the last are the first, and the distance alone counts.
@@ -115,7 +119,7 @@ def refine(
     return Refined(u, v, rest, per_noise)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def local_mean(u, v, keep, radius, stride):  # type: ignore[no-untyped-def]
     """Mean displacements of the kept pixels of each window that lie within one pixel of the middle's displacement.
 
@@ -158,45 +162,80 @@ def _axes(to_right: Frame, now: Maps) -> AnyArray | None:
     if there[0] is now[0]:
         return None
     ends = *to_right(now[0] + 1, now[1]), *to_right(now[0], now[1] + 1)
-    return np.asarray(np.nan_to_num([end - begin for end, begin in zip(ends, 2 * there, strict=True)]))
+    axes = np.stack([end - begin for end, begin in zip(ends, 2 * there, strict=True)])
+    axes[~np.isfinite(axes)] = 0
+    return axes
 
 
-def _window_steps(planes: AnyArray, axes: AnyArray | None, keep: AnyArray, upright: bool) -> tuple[AnyArray, ...]:
-    """Steps of all windows, from :func:`_warped`: columns and rows (row, col), zero where there is no step; residual
-    variance before the step, infinite where there is none; and the variance of the column, or the row, for a unit of
-    variance of the grey levels."""
-    known, gx, gy, rest = planes
-    if axes is not None:
-        gx, gy = gx * axes[0] + gy * axes[1], gx * axes[2] + gy * axes[3]
-    side, nil = 2 * WINDOW_RADIUS_PX + 1, np.float32(0)
-    count, *sums = (window_sum32(plane, side) for plane in (known, gx, gy, rest))
-    n, use = np.maximum(count, np.float32(1)), keep & (count >= 0.5 * side**2)
-    parts = [(plane, total / n) for plane, total in zip((gx, gy, rest), sums, strict=True)]
-
-    def moment(i: int, j: int) -> AnyArray:
-        """Sum of products of the gradient or the difference, less their means over the window."""
-        (a, mean_a), (b, mean_b) = parts[i], parts[j]
-        return window_sum32(a * b, side) - mean_a * mean_b * n
-
-    # Assumed noise, 8 squared grey levels a pixel, on the diagonal shortens steps where texture is weak, and keeps the
-    # determinant positive.
-    a, b, c = moment(0, 0) + np.float32(8) * n, moment(0, 1), moment(1, 1) + np.float32(8) * n
-    p, q, det = moment(0, 2), moment(1, 2), a * c - b * b
-    # A pixel at most: beyond it the step is a guess.
-    step_u, step_v = (np.where(use, np.clip(d / det, -1, 1), nil) for d in (c * p - b * q, a * q - b * p))
-    # Rounding may leave the residual of a perfect fit below zero.
-    left = np.where(use, np.maximum(moment(2, 2), nil) / n, np.float32(np.inf))
-    return step_u, step_v, left, np.where(use, (a if upright else c) / det, nil)
+PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
+"""Products that are summed over a window: of each two of 1, gradient (x, y) and difference, see :func:`_warped`."""
 
 
-def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray) -> AnyArray:
-    """Planes (4, row, col), zero where a pixel takes no part: 1, gradient (x, y) of the right image, left minus it."""
-    planes = np.zeros((4, *u.shape), np.float32)
-    _warp(images, u, v, keep, planes)
+@kernel
+def _window_steps(planes, keep, upright):  # type: ignore[no-untyped-def]
+    """Steps of all windows, from :func:`_warped` with a frame of a window's radius.
+
+    Planes (4, row, col): columns and rows, zero where there is no step; residual variance before the step, infinite
+    where there is none; and the variance of the column, or the row, for a unit of variance of the grey levels.
+    """
+    (rows, cols), side = keep.shape, 2 * WINDOW_RADIUS_PX + 1
+    out = np.empty((4, rows, cols), np.float32)
+    column, sums = np.empty(cols + side - 1, np.float32), np.empty((len(PAIRS), cols), np.float32)
+    for y in range(rows):
+        for k, (i, j) in enumerate(PAIRS):
+            a, b, window = planes[i], planes[j], sums[k]
+            for x in range(column.size):
+                total = np.float32(0)
+                for row in range(side):
+                    total += a[y + row, x] * b[y + row, x]
+                column[x] = total
+            for x in range(cols):
+                total = np.float32(0)
+                for beside in range(side):
+                    total += column[x + beside]
+                window[x] = total
+        _solve_windows(sums, keep[y], upright, (out[0, y], out[1, y], out[2, y], out[3, y]))
+    return out
+
+
+@kernel
+def _solve_windows(sums, keep, upright, out):  # type: ignore[no-untyped-def]
+    """Steps (4, col) of a row, from the sums of :data:`PAIRS` over the window of each of its pixels."""
+    one, nil, far = np.float32(1), np.float32(0), np.float32(np.inf)
+    # Assumed noise, squared grey levels a pixel, on the diagonal shortens steps where texture is weak, and keeps the
+    # determinant positive. A window needs half of its pixels.
+    noise, least = np.float32(8), np.float32(0.5 * (2 * WINDOW_RADIUS_PX + 1) ** 2)
+    step_u, step_v, left, per_noise = out
+    for x in range(keep.size):
+        n = max(sums[0, x], one)
+        use, gx, gy, r = keep[x] & (n >= least), sums[1, x] / n, sums[2, x] / n, sums[3, x] / n
+        # Products of the gradient and the difference, less their means over the window.
+        a, b, c = sums[4, x] - gx * gx * n + noise * n, sums[5, x] - gx * gy * n, sums[7, x] - gy * gy * n + noise * n
+        p, q, det = sums[6, x] - gx * r * n, sums[8, x] - gy * r * n, a * c - b * b
+        # A pixel at most: beyond it the step is a guess.
+        step_u[x] = min(max((c * p - b * q) / det, -one), one) if use else nil
+        step_v[x] = min(max((a * q - b * p) / det, -one), one) if use else nil
+        # Rounding may leave the residual of a perfect fit below zero.
+        left[x] = max(sums[9, x] - r * r * n, nil) / n if use else far
+        per_noise[x] = (a if upright else c) / det if use else nil
+
+
+def _inner(plane: AnyArray, frame: int) -> tuple[slice, slice]:
+    """Index of a plane without its frame of so many pixels."""
+    rows, cols = plane.shape
+    return slice(frame, rows - frame), slice(frame, cols - frame)
+
+
+def _warped(images: SplineImages, u: AnyArray, v: AnyArray, keep: AnyArray, frame: int = 0) -> AnyArray:
+    """Planes (4, row, col) in a ``frame`` of pixels, zero where a pixel takes no part: 1, gradient (x, y) of the right
+    image, left minus it."""
+    rows, cols = u.shape
+    planes = np.zeros((4, rows + 2 * frame, cols + 2 * frame), np.float32)
+    _warp(images, u, v, keep, planes[:, *_inner(planes[0], frame)])
     return planes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _warp(images, u, v, keep, out):  # type: ignore[no-untyped-def]
     spline, half = images.spline, np.float32(0.5)
     last_x, last_y = spline.shape[1] - 2, spline.shape[0] - 2

@@ -33,10 +33,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.kernel import kernel
 from rille.stages.hfvm import epipolar, plane
 from rille.stages.hfvm.image import Image, Window, distance, thinned, whole
 from rille.stages.hfvm.level import MAX_FIT_MATCHES
@@ -137,7 +137,7 @@ def _sums(region: Region, at: AnyArray) -> AnyArray:
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _end(region, y, x, step):  # type: ignore[no-untyped-def]
     """Row and column of the right image to which a step along its line leads a pixel."""
     line = region.lines[y, x]
@@ -145,7 +145,7 @@ def _end(region, y, x, step):  # type: ignore[no-untyped-def]
     return np.int64(np.rint(y + region.y0 + v)), np.int64(np.rint(x + region.x0 + u))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
     """Distances of a region's pixels to those their step away along their lines."""
     rows, cols = region.right.shape
@@ -159,29 +159,32 @@ def _distances(region, at, cost, outside):  # type: ignore[no-untyped-def]
                     cost[y, x] = min(distance(region.left[y, x], region.right[j, i]), 60)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _update(region, step, sums, state):  # type: ignore[no-untyped-def]
     """Update ``state`` with the sums of one more step; ``sums``: those of the step before, the least of those far
     behind, and the windows' sizes besides."""
     total, previous, passed, size = sums
+    # Numbers of a structure's arrays are read anew for each pixel, one at a time: so they have names of their own.
+    tried, best, least, before, after, rival, claim, claimant = state
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
-            since = step - state.best[y, x]
-            if total[y, x] < state.least[y, x]:
-                state.best[y, x], state.least[y, x] = step, total[y, x]
-                state.before[y, x], state.after[y, x], state.rival[y, x] = previous[y, x], np.inf, passed[y, x]
-            elif since == 1:
-                state.after[y, x] = total[y, x]
-            elif since > MIN_DISTINCT_STEPS:
-                state.rival[y, x] = min(state.rival[y, x], total[y, x])
+            if total[y, x] < least[y, x]:
+                best[y, x], least[y, x] = step, total[y, x]
+                before[y, x], after[y, x], rival[y, x] = previous[y, x], np.inf, passed[y, x]
+            elif step - best[y, x] == 1:
+                after[y, x] = total[y, x]
+            elif step - best[y, x] > MIN_DISTINCT_STEPS:
+                rival[y, x] = min(rival[y, x], total[y, x])
+        for x in range(total.shape[1]):
             if total[y, x] < np.inf:
-                state.tried[y, x] += 1
+                tried[y, x] += 1
                 j, i = _end(region, y, x, step)
-                if total[y, x] / size[y, x] < state.claim[j, i]:
-                    state.claim[j, i], state.claimant[j, i] = total[y, x] / size[y, x], step
+                mean = total[y, x] / size[y, x]
+                if mean < claim[j, i]:
+                    claim[j, i], claimant[j, i] = mean, step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _judge(region, state, found):  # type: ignore[no-untyped-def]
     """Write the results of all steps. Near their minimum sums of absolute differences are two lines, no parabola."""
     for y in range(found.mutual.shape[0]):

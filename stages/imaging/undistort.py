@@ -10,11 +10,11 @@ of the image or of the usable pixels hardly shows.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Bytes, Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, within
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.spline import coefficients, value_and_gradient
@@ -62,7 +62,7 @@ def undistort(image: AnyArray, lens: Lens, camera: Camera, valid: AnyArray | Non
     return np.clip(out, 0.0, 255.0, out=out), out_valid
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _resample(spline, usable, maps, out, out_valid):  # type: ignore[no-untyped-def]
     """Values of the spline at (column, row) of the maps, where the raw pixels around are usable."""
     column, row = maps

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes, Floats32
+from rille.stages.core.kernel import kernel
 from rille.stages.numeric.windows import window_count
 
 RIM_STD_SHARE = 1.0 / math.sqrt(12.0)
@@ -53,7 +53,7 @@ def candidates(elevation: Floats32, n: int, min_known: float) -> NDArray[np.int6
     return np.flatnonzero(unknown & (window_count(~unknown, n) >= min_known * n * n))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _close(z, cells, max_gap, out, std, filled):  # type: ignore[no-untyped-def]
     """Close the ``cells`` that lie between known ones of ``z``."""
     cols = z.shape[1]
@@ -83,7 +83,7 @@ def _close(z, cells, max_gap, out, std, filled):  # type: ignore[no-untyped-def]
             std[r, c] = max(worst, RIM_STD_SHARE * (high - low))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _to_known(z, cell, step, reach):  # type: ignore[no-untyped-def]
     """Number of steps from a cell to the next known one, at most ``reach``; 0: there is none."""
     rows, cols = z.shape

@@ -13,9 +13,9 @@ A sweep takes the cells in the order of reading.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats32
+from rille.stages.core.kernel import kernel
 
 OVERRELAXATION = 1.7
 """Factor on each step, which stays convergent below 2."""
@@ -69,7 +69,7 @@ def relax(
     return np.where(keep, field[inner] + middle, start)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(field, across, down, goal, inverse, sweeps):  # type: ignore[no-untyped-def]
     """Relax a field in place; it and the weights of the bends have a border.
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.cubic import cubic
 
 HALF = 5
@@ -133,7 +133,7 @@ def _drawn(image: Floats32, at: Floats, affinity: Floats, half: int) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample(image, places, out):  # type: ignore[no-untyped-def]
     """Grey values ``out`` (n, k) at places (n, 2, k); NaN where cubic interpolation reads beyond the image."""
     rows, cols = image.shape

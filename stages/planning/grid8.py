@@ -11,10 +11,10 @@ from __future__ import annotations
 from heapq import heappop, heappush
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
+from rille.stages.core.kernel import kernel
 from rille.stages.planning.row_graph import NEIGHBOURS, UNREACHED, Cell, GridCosts, Ints
 
 
@@ -29,7 +29,7 @@ def search(terrain: GridCosts, start: Cell, target: Cell | None = None) -> tuple
     return cost, step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(terrain, first, last, cost, step):  # type: ignore[no-untyped-def]
     height, ways, toll = terrain.height, terrain.ways, terrain.toll
     rows, cols = height.shape
@@ -65,7 +65,7 @@ def parts(ways: Bytes) -> tuple[NDArray[np.int32], Ints]:
     return number, spans[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
     rows, cols = ways.shape
     stack = np.empty(ways.size, dtype=np.int64)

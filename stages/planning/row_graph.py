@@ -14,10 +14,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bytes
+from rille.stages.core.kernel import kernel
 from rille.stages.planning.configuration_space import ACROSS, LEFT, RIGHT, STRAIGHT
 
 Cell = tuple[int, int]
@@ -54,7 +54,7 @@ def sweep(terrain: GridCosts, first: Ints) -> tuple[Ints, NDArray[np.int8]]:
     return cost, step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(terrain, cost, step):  # type: ignore[no-untyped-def]
     height, ways, toll = terrain.height, terrain.ways, terrain.toll
     rows, cols = height.shape

@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from rille.stages.core.arrays import Floats, Floats32
 from rille.stages.core.declare import Bundle, Params, raster, stage
+from rille.stages.core.kernel import kernel
 from rille.stages.facts.terrain import BoundsFacts, DemFacts, MergeFacts
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
@@ -70,7 +70,7 @@ def ceiling(elevation: Floats32, lattice: Lattice, centre: Floats) -> Floats32:
     return np.where(np.isfinite(out), out, np.float32(np.nan))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _below(z, row, col, height, out):  # type: ignore[no-untyped-def]
     """Go from each known cell towards the camera, up to the next known one."""
     rows, cols = z.shape

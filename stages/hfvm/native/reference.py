@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from rille.stages.core.kernel import kernel
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import distance
 from rille.stages.hfvm.native.problem import CANDIDATES
@@ -58,7 +59,7 @@ def _off(line, shift, most):  # type: ignore[no-untyped-def]
 # -- the top level -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def exhaustive(pair, reach, out):  # type: ignore[no-untyped-def]
     """Write the displacements within ``reach`` (columns, rows) whose distance, summed over 3 x 3 pixels, is least.
 
@@ -102,7 +103,7 @@ def exhaustive(pair, reach, out):  # type: ignore[no-untyped-def]
 # -- search ------------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(pair, up, reach, out):  # type: ignore[no-untyped-def]
     """Write the best displacements around the doubled ones of the coarse parent and of the pixels beside it.
 
@@ -146,7 +147,7 @@ def search(pair, up, reach, out):  # type: ignore[no-untyped-def]
                     out.shift[y, x], out.cost[y, x] = best, least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _candidates(near, reach, mu, tried):  # type: ignore[no-untyped-def]
     """Displacements that the pixels of a parent try, in the order in which equal ones win, and how many.
 
@@ -181,7 +182,7 @@ def _candidates(near, reach, mu, tried):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _strip(u, v, first, count, tried, n):  # type: ignore[no-untyped-def]
     """Add ``count`` displacements of row ``v``, that of the centre's column ``u`` before the others, to ``n``."""
     if first <= u < first + count:
@@ -194,7 +195,7 @@ def _strip(u, v, first, count, tried, n):  # type: ignore[no-untyped-def]
 # -- propagation -------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def propagate(pair, field, smoothing):  # type: ignore[no-untyped-def]
     """Improve displacements in place: each pixel tries its neighbours' and those beside its own.
 
@@ -260,7 +261,7 @@ def _roughness(shift, near):  # type: ignore[no-untyped-def]
 # -- fractions of a pixel ----------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sums(pair, us, vs, wanted):  # type: ignore[no-untyped-def]
     """Displacements with fractions of a pixel, and distances, from distances summed over 5 x 5 pixels (paper, 4.3.2).
 
@@ -292,7 +293,7 @@ def sums(pair, us, vs, wanted):  # type: ignore[no-untyped-def]
     return out_u, out_v, apart
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _summed(window, right, q, p):  # type: ignore[no-untyped-def]
     """Distances of a window summed, its middle at row ``q`` and column ``p`` of the right image."""
     total = 0
@@ -327,7 +328,7 @@ EDGE_REACH_PX, EDGE_RADIUS_PX, MIN_APART_PX = 4, 3, 4
 EDGE_GREY, MAX_EDGE_DISTANCE, OWN_FACTOR, OTHER_FACTOR = 16, 100, 9, 10
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def edges(pair, grey, shift, wanted, near_sign):  # type: ignore[no-untyped-def]
     """Packed displacements (row, col) int32, depth edges placed anew, see :mod:`rille.stages.hfvm.level`.
 
@@ -359,7 +360,7 @@ def edges(pair, grey, shift, wanted, near_sign):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sides(shift, y, x, tried):  # type: ignore[no-untyped-def]
     """Number of the different displacements at a pixel and around it, its own first."""
     count, tried[0] = 1, shift[y, x]
@@ -374,7 +375,7 @@ def _sides(shift, y, x, tried):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _edge_cost(pair, grey, y, x, q, p):  # type: ignore[no-untyped-def]
     """Sum over a window of the distances, limited, by how alike in grey a pixel is to the middle."""
     own, total = np.int32(grey[y, x]), np.int64(0)
@@ -403,7 +404,7 @@ AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-3, -3), (-3, 3), (3, -3), (3, 3), 
 """Rows and columns from a pixel to those whose displacements it tries on a path: beside it, beyond an edge, a gap."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def paths(pair, compact, up, grey, shift):  # type: ignore[no-untyped-def]
     """Write to ``shift`` the candidates of each pixel of least cost along paths; of equal ones the first.
 
@@ -430,7 +431,7 @@ def paths(pair, compact, up, grey, shift):  # type: ignore[no-untyped-def]
             shift[y, x] = tried[y, x, np.where(cost[y, x] == NO_CANDIDATE, FAR, total[y, x]).argmin()]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(tried, cost, grey, s, total):  # type: ignore[no-untyped-def]
     """Add the costs along three directions: from the upper left, above, the upper right; ``s`` = -1: their opposites.
 
@@ -460,7 +461,7 @@ def _sweep(tried, cost, grey, s, total):  # type: ignore[no-untyped-def]
         before, after = after, before
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _list(pair, compact, up, shift, y, tried, cost):  # type: ignore[no-untyped-def]
     """Write the candidates of the pixels of a row, and their costs."""
     (rows, cols), (high, wide) = shift.shape, pair.right.shape

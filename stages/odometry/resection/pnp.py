@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.projection import NEAREST_M, Pinhole, linearise, perturbed, rotated
 from rille.stages.numeric.robust import huber_weight
@@ -95,7 +95,7 @@ def back_projection(obs: Observations, pose: Pose) -> Errors:
     return Errors(whitened[..., :7], whitened[..., 7], *lengths.T)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _linearised(seen, R, t, whitened, lengths):  # type: ignore[no-untyped-def]
     """Fill ``whitened`` (n, 2, 8): Jacobian and error; ``lengths`` (n, 3): whitened, in pixels, stretch."""
     sigma = seen.pixel_sigma

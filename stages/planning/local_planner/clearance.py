@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BODY_BITS, WHEEL_BITS
 from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
@@ -76,7 +76,7 @@ class Straddle(NamedTuple):
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def stands(straddle, at, heights):  # type: ignore[no-untyped-def]
     """Return whether all wheels stand on ground that was seen, and the slope between them is surely within the limit.
 
@@ -101,7 +101,7 @@ def stands(straddle, at, heights):  # type: ignore[no-untyped-def]
     return along * along + across * across <= straddle.limits[3]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clears(straddle, point, row, col, heights):  # type: ignore[no-untyped-def]
     """Whether a point of the belly has its clearance over a cell, with the wheels at these heights, m."""
     top, rise = straddle.top[row, col], 0.0
@@ -302,7 +302,7 @@ def _belly(vehicle: Vehicle) -> Floats:
     return np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cell_under(poses, n, point):  # type: ignore[no-untyped-def]
     """Row and column of the cell under a point of the vehicle, right and ahead of its middle, cells, at pose ``n``."""
     c, s = poses.cosine[n], poses.sine[n]
@@ -311,7 +311,7 @@ def _cell_under(poses, n, point):  # type: ignore[no-untyped-def]
     return math.floor(row + 0.5), math.floor(col + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gaps(poses, parts, maps, out):  # type: ignore[no-untyped-def]
     """Fill ``out``, the arrays (n,) of :class:`Gaps`."""
     rows, cols = maps.unknown.shape

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.planning.local_planner.clearance import Footing, Gaps
 
@@ -177,7 +177,7 @@ class _Moves(NamedTuple):
     back: float
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(prices, goals, moves, end, cost, move):  # type: ignore[no-untyped-def]
     rows, cols = goals.shape
     area = rows * cols

@@ -27,6 +27,7 @@ import numpy as np
 from numba import njit
 
 from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.kernel import kernel
 
 MIN_DEPTH_M = 1e-9  # metres, projective depth: excludes the camera's own plane
 MARGIN_STEPS = 1.0  # that the interval handed down from the coarse level is widened by
@@ -150,7 +151,7 @@ class Solution(NamedTuple):
     grey: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
     """Solve every cell of :class:`Cells` from what is :class:`Observed`.
 
@@ -170,7 +171,7 @@ def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
             elevation[r, c], std[r, c], residual[r, c], ortho[r, c] = cell
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_of(P, x, y):  # type: ignore[no-untyped-def]
     """Line of a cell at x, y in an image by its projection (3, 4)."""
     return Line(
@@ -183,7 +184,7 @@ def line_of(P, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def visible(lines, sizes, z_range):  # type: ignore[no-untyped-def]
     """Part (low, high) of ``z_range`` that projects into both images; empty (low > high) where there is none."""
     low, high = z_range
@@ -207,7 +208,7 @@ def visible(lines, sizes, z_range):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fastest(line, span):  # type: ignore[no-untyped-def]
     """Square of the greatest image speed |d p / d Z| of a line on a span, pixels per metre.
 
@@ -222,7 +223,7 @@ def fastest(line, span):  # type: ignore[no-untyped-def]
     return speed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
     """:class:`SearchSteps` of a cell on the visible ``span`` of Z, from the interval ``start``, both (low, high)."""
     bottom, top = span

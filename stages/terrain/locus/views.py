@@ -16,9 +16,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.kernel import kernel
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.spline import value_and_gradient
 from rille.stages.numeric.windows import window_mean
@@ -87,7 +87,7 @@ def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> 
     return np.where(np.isfinite(share), share, 1.0).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _look(xs, ys, zs, cell, views, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` of the cells, ``cell`` m wide, at ``xs`` (cols,), ``ys`` (rows,) and ``zs`` (rows, cols)."""
     # Arrays are taken out of their tuples before the loops: each time costs an atomic count of references.
@@ -120,7 +120,7 @@ def _look(xs, ys, zs, cell, views, out):  # type: ignore[no-untyped-def]
             scale[r, c] = math.hypot(shift[0], shift[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pixel(P, x, y, z):  # type: ignore[no-untyped-def]
     """x, y, pixels, and the inverse of the projective depth of a point."""
     part = 1.0 / (P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3])
@@ -128,7 +128,7 @@ def _pixel(P, x, y, z):  # type: ignore[no-untyped-def]
     return across * part, down * part, part
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_inside(at, shape):  # type: ignore[no-untyped-def]
     """Whether the spline of an image of a shape is defined at a pixel in front of the camera."""
     x, y, part = at
@@ -136,14 +136,14 @@ def _is_inside(at, shape):  # type: ignore[no-untyped-def]
     return part > 0.0 and x >= 1.0 and y >= 1.0 and x < cols - 2.0 and y < rows - 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _shift(P, at, dx, dy):  # type: ignore[no-untyped-def]
     """Pixels that the projection ``at`` of a point moves by a metre of elevation along the direction (dx, dy, 1)."""
     across, along, up = _motion(P, at, 0), _motion(P, at, 1), _motion(P, at, 2)
     return dx * across[0] + dy * along[0] + up[0], dx * across[1] + dy * along[1] + up[1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _motion(P, at, axis):  # type: ignore[no-untyped-def]
     """Pixels that the projection ``at`` (x, y, 1 / depth) of a point moves by a metre of the point along an axis."""
     x, y, part = at
