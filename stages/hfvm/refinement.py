@@ -260,24 +260,37 @@ def surroundings(rest: AnyArray, deviations: Maps, keep: AnyArray, noise: tuple[
     b^2 and the difference, if that raises the correlation and the left image shows more than noise.
     """
     known = keep & (rest < np.inf)
-    planes = (np.where(known, a, np.float32(0)) for a in (rest, *(d * d for d in deviations), np.ones_like(rest)))
+    planes = (np.where(known, a, np.float32(0)) for a in (rest, *(d * d for d in deviations)))
     # Fewer pixels do not tell correlated noise from texture.
-    differ, a, b, count = (window_sum32(plane, 9) for plane in planes)
-    correlation = _alike(differ, a, b)
-    if any(noise):
-        rest = np.maximum(differ - np.float32(sum(noise)) * count, np.float32(0))
-        without = _alike(rest, a - np.float32(noise[0]) * count, b - np.float32(noise[1]) * count)
-        # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
-        # noise alone, of which denoising leaves about .3.
-        shown = a > np.float32(0.4**2 * noise[0]) * count
-        correlation = np.where(shown, np.maximum(correlation, without), correlation)
-    return np.where(a > 0, correlation, np.float32(1)), differ / np.maximum(count, np.float32(1))
+    sums = tuple(window_sum32(plane, 9) for plane in (*planes, known))
+    correlation, differ = np.empty_like(rest), np.empty_like(rest)
+    _correlations(sums, (np.float32(noise[0]), np.float32(noise[1])), correlation, differ)
+    return correlation, differ
 
 
-def _alike(differ: AnyArray, a: AnyArray, b: AnyArray) -> AnyArray:
+@kernel
+def _correlations(sums, noise, correlation, differ):  # type: ignore[no-untyped-def]
+    """Correlations and mean differences of windows, from their sums: of the variances of the difference and of both
+    images, and of the number of pixels."""
+    differs, left, right, counts = sums
+    # 0.4: local deviation for each grey level of noise that was removed from the left image, up to which it may be
+    # noise alone, of which denoising leaves about .3.
+    shown, both, one, nil = np.float32(0.4**2) * noise[0], noise[0] + noise[1], np.float32(1), np.float32(0)
+    for y in range(correlation.shape[0]):
+        for x in range(correlation.shape[1]):
+            n, a, b = counts[y, x], left[y, x], right[y, x]
+            alike = _alike(differs[y, x], a, b)
+            without = _alike(max(differs[y, x] - both * n, nil), a - noise[0] * n, b - noise[1] * n)
+            alike = max(alike, without) if a > shown * n else alike
+            correlation[y, x] = alike if a > nil else one
+            differ[y, x] = differs[y, x] / max(n, one)
+
+
+@kernel
+def _alike(differ, a, b):  # type: ignore[no-untyped-def]
     """Correlation of signals of the variances ``a, b`` whose difference has the variance ``differ``."""
-    a, b = (np.maximum(variance, np.float32(1e-6)) for variance in (a, b))
-    return np.asarray((a + b - differ) / (np.float32(2.0) * np.sqrt(a * b)))
+    a, b = max(a, np.float32(1e-6)), max(b, np.float32(1e-6))
+    return (a + b - differ) / (np.float32(2) * np.sqrt(a * b))
 
 
 BEND_STIFFNESS = 2000.0
