@@ -111,6 +111,11 @@ def test_every_module_says_what_it_is(path: Path) -> None:
     assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
 
 
+def test_kernels_are_compiled_in_one_way() -> None:
+    """A plain ``njit`` has each divisor checked, which takes several times as long."""
+    assert {name_of(p) for p in MODULES if "njit" in p.read_text(encoding="utf-8")} == {"rille.stages.core.kernel"}
+
+
 def test_the_check_itself_sees_a_wrong_import(tmp_path: Path) -> None:
     bad = tmp_path / "bad.py"
     bad.write_text("def f():\n    from rille.pipeline.engine.store.base import Store\n    import zarr\n")

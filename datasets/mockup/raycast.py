@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.kernel import kernel
+from rille.stages.core.kernel import inlined, kernel
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def _cast(height, pyramid, origins, directions):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _within(o, d, inv, edge):  # type: ignore[no-untyped-def]
     """Ray parameters between which a ray is over the grid along one axis; ``inv`` = 1 / ``d``."""
     if d == 0.0:
@@ -157,7 +156,7 @@ def _within(o, d, inv, edge):  # type: ignore[no-untyped-def]
     return min(a, b), max(a, b)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _leaves(o, d, inv, block, level):  # type: ignore[no-untyped-def]
     """Ray parameter at which a ray leaves a block of the pyramid along one axis."""
     if d == 0.0:
@@ -165,7 +164,7 @@ def _leaves(o, d, inv, block, level):  # type: ignore[no-untyped-def]
     return (((block + 1 if d > 0.0 else block) << level) - o) * inv
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _first_root(f0, f1, f2):  # type: ignore[no-untyped-def]
     """Smallest positive root of f0 + f1 s + f2 s^2 with f0 > 0; infinity for none."""
     disc = f1 * f1 - 4.0 * f2 * f0

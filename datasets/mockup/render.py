@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 
 from rille.datasets.facts import ImageFacts
 from rille.datasets.mockup.facts import SceneFacts
@@ -22,7 +21,7 @@ from rille.datasets.mockup.scene import ALBEDO_LEVELS, height_field
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.arrays import Bools, Bytes, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Memory, stage
-from rille.stages.core.kernel import kernel
+from rille.stages.core.kernel import inlined, kernel
 from rille.stages.geometry.geometry import Camera, RigidTransform
 
 MCEWEN_L = 0.6
@@ -116,7 +115,7 @@ def _shade(bed, albedo, origin, directions, distance, pixel_angle):  # type: ign
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _bilinear(a, r, c):  # type: ignore[no-untyped-def]
     """Bilinear value at (row, column), clamped to the grid."""
     r = min(max(r, 0.0), a.shape[0] - 1.000001)

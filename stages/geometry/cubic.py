@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from rille.stages.core.kernel import inlined
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def cubic(a, x, y):  # type: ignore[no-untyped-def]
     """Catmull-Rom value (float32) of an image ``a`` at (x, y), a pixel or more inside."""
     whole_x, whole_y = np.int64(x), np.int64(y)

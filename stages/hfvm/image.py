@@ -18,12 +18,11 @@ from functools import cached_property, partial
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
-from rille.stages.core.kernel import kernel
+from rille.stages.core.kernel import inlined, kernel
 from rille.stages.hfvm.params import HfvmParams, Weights
 from rille.stages.imaging import pyramid
 from rille.stages.imaging.pyramid import Pyramid
@@ -231,7 +230,7 @@ def _pack(framed, taps, scale, words, deviation):  # type: ignore[no-untyped-def
             deviation[y, x] = features[DEVIATION, x]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _byte(value, scale):  # type: ignore[no-untyped-def]
     root = np.sqrt(abs(value)) * scale
     # 128 stands for zero, so that the sign fits into a byte; the half more makes truncation round.
@@ -239,7 +238,7 @@ def _byte(value, scale):  # type: ignore[no-untyped-def]
     return np.uint64(np.int32(min(max(byte, np.float32(0.0)), np.float32(255.0))))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def distance(a, b):  # type: ignore[no-untyped-def]
     """Sum of absolute differences of the eight bytes of two words (Eq. 1, absolute form), for numba kernels."""
     one, low, eight = np.uint64(0x0001000100010001), np.uint64(0x00FF00FF00FF00FF), np.uint64(8)

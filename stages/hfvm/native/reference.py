@@ -7,9 +7,8 @@ pixel by pixel; what makes them fast is for the C code.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from rille.stages.core.kernel import kernel
+from rille.stages.core.kernel import inlined, kernel
 from rille.stages.hfvm import epipolar
 from rille.stages.hfvm.image import distance
 from rille.stages.hfvm.native.problem import CANDIDATES
@@ -30,26 +29,26 @@ SUM_RADIUS = 2
 """Pixels: reach of the windows over which distances are summed."""
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def pack(u, v):  # type: ignore[no-untyped-def]
     """One 32-bit word of two 16-bit displacements."""
     return np.int32((v << 16) | (u & 0xFFFF))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def columns(shift):  # type: ignore[no-untyped-def]
     """Column displacement."""
     # Through int16, so that the lower half keeps its sign.
     return np.int64(np.int16(shift))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def rows_of(shift):  # type: ignore[no-untyped-def]
     """Row displacement."""
     return np.int64(shift) >> 16
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _off(line, shift, most):  # type: ignore[no-untyped-def]
     """Cost of a displacement off an epipolar line, whole byte steps, at most ``most``."""
     off = abs((line[0] * np.float32(columns(shift)) + line[1] * np.float32(rows_of(shift))) + line[2])
@@ -237,19 +236,19 @@ def propagate(pair, field, smoothing):  # type: ignore[no-untyped-def]
                     dirty[up, x] = dirty[down, x] = True
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _mirrored(index, size):  # type: ignore[no-untyped-def]
     """Index of the pixel that stands for one beyond the border: the one on the other side."""
     return min(1, size - 1) if index < 0 else max(size - 2, 0) if index >= size else index
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _apart(a, b):  # type: ignore[no-untyped-def]
     """|du| + |dv| of the difference of two displacements."""
     return abs(columns(a) - columns(b)) + abs(rows_of(a) - rows_of(b))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _roughness(shift, near):  # type: ignore[no-untyped-def]
     """Sum over the neighbours of min(|du| + |dv|, 2 pixels): depth edges, where a step is longer, stay."""
     total = 0
@@ -303,7 +302,7 @@ def _summed(window, right, q, p):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def linear(before, at, after):  # type: ignore[no-untyped-def]
     """Where two lines of equal and opposite slope through three distances meet, within half a pixel."""
     steep = np.float32(max(before, after) - at)

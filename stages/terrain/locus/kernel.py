@@ -24,10 +24,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rille.stages.core.arrays import Floats, Floats32
-from rille.stages.core.kernel import kernel
+from rille.stages.core.kernel import inlined, kernel
 
 MIN_DEPTH_M = 1e-9  # metres, projective depth: excludes the camera's own plane
 MARGIN_STEPS = 1.0  # that the interval handed down from the coarse level is widened by
@@ -236,7 +235,7 @@ def steps_of(lines, span, start):  # type: ignore[no-untyped-def]
     return SearchSteps(bottom, dz, int(count), int(first), np.floor((start[0] - bottom) / dz) - MARGIN_STEPS)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     """:class:`Mismatch` of a cell's point at elevation z."""
     left, right = lines.left, lines.right
@@ -265,7 +264,7 @@ def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     return Mismatch(s, gy * ex - gx * ey, power, x, y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def solve_cell(lines, span, start, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` of one cell on the visible ``span`` of Z, searched from the interval ``start``."""
     solution = Solution(np.nan, np.nan, np.nan, np.nan)
@@ -295,7 +294,7 @@ def solve_cell(lines, span, start, epipole, seen):  # type: ignore[no-untyped-de
     return solution
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def root(lines, bracket, epipole, disparity):  # type: ignore[no-untyped-def]
     """Elevation in a bracket at which s is 0, by regula falsi (Illinois), and the :class:`Mismatch` there; NaN where
     disparity is undefined."""
@@ -317,7 +316,7 @@ def root(lines, bracket, epipole, disparity):  # type: ignore[no-untyped-def]
     return z, at
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` in a bracket, ``dz`` high; NaN where it does not stand."""
     nothing = Solution(np.nan, np.nan, np.nan, np.nan)
@@ -341,7 +340,7 @@ def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     return Solution(z, std, residual, upper * (1.0 - fy) + lower * fy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@inlined
 def is_jump(disparity, seen, r, c):  # type: ignore[no-untyped-def]
     """Whether the disparities of the bilinear cell at row r and column c differ by more than ``max_jump``.
 
