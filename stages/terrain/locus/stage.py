@@ -164,9 +164,14 @@ def _of_ground(rig: Rig, level: Mapping[str, Any]) -> PlaneView:
     return view_ground(rig, RigidTransform.from_matrix(level["T_local_left"]).rotation, level["plane"])
 
 
-def _limited(params: LocusParams, level: Mapping[str, Any], cell: float) -> LocusParams:
-    """The parameters, with the largest standard deviation filled in from the scene where none is given."""
-    return params.model_copy(update={"max_sigma": params.max_sigma or max(level.get("max_sigma", 0.0), cell)})
+def _limited(params: LocusParams, reference: Mapping[str, Any], level: Mapping[str, Any], cell: float) -> LocusParams:
+    """The parameters, with the largest standard deviation filled in from the scene where none is given.
+
+    It is the cell. Where that is not given either, and suits the first pair (``reference``), a pair that is farther
+    from its ground (``level``) may err by the cell that would suit it: in the merge its cells weigh as little.
+    """
+    own = level["cell_size"] if params.cell_size is None else 0.0
+    return params.model_copy(update={"max_sigma": params.max_sigma or max(reference.get("max_sigma", 0.0), own, cell)})
 
 
 def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTransform) -> tuple[Lattice, list[float]]:
@@ -215,7 +220,7 @@ def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]
             lattice = Lattice.snap(params.extent or level["footprint"], cell)
         else:
             lattice = local_lattice(
-                _of_ground(Rig.from_dict(metas["rig"]["rig"]), level), cell, _limited(params, level, cell)
+                _of_ground(Rig.from_dict(metas["rig"]["rig"]), level), cell, _limited(params, level, level, cell)
             )
     return 24.0 * lattice.rows * lattice.cols
 
@@ -271,12 +276,12 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         local = Lattice.from_dict(inputs.local.meta["lattice"])
         T = RigidTransform.from_matrix(np.asarray(trajectory["poses"])[row])
         lattice, z_range = world_lattice(np.asarray(inputs.local["elevation"]), local, T @ T_local_left.inverse())
-        params = _limited(params, reference, local.cell)
+        params = _limited(params, reference, level, local.cell)
     else:
         if level["plane"] is None or level["relief"] is None or ("no_ground" in level and params.cell_size is None):
             raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
         cell = params.cell_size or reference["cell_size"]
-        params = _limited(params, reference, cell)
+        params = _limited(params, reference, level, cell)
         seen = view_matches(sampled(matches, rig, params.sigma_disparity), T_local_left)
         view = seen if level["source"] == REFERENCE_PLANE else _of_ground(rig, level)
         T, lattice = T_local_left, local_lattice(view, cell, params)

@@ -502,6 +502,16 @@ def test_stage_parameters_of_the_lattice() -> None:
         )
 
 
+def test_a_pair_that_is_farther_from_its_ground_than_the_first_one_has_a_model_in_its_cells() -> None:
+    inputs, args = bundles(RIG, HEIGHT, np.random.default_rng(2)), {"pair": 0, "frame": "local"}
+    inputs["reference"] = Bundle({}, inputs["level"].meta | {"cell_size": 0.002})
+    local = stage.locus_stage.run(LocusParams(), args, inputs)
+    assert local.meta["lattice"]["cell"] == 0.002
+    assert local.meta["defined"] > 0.5
+    with raises("RIL-344"):  # as accurate as stated
+        stage.locus_stage.run(LocusParams(cell_size=0.002), args, inputs)
+
+
 def test_the_automatic_extent_ends_where_pixels_cover_too_many_cells() -> None:
     """Camera 1.65 m above a street: a pixel at y covers y^2 / (f h) along the range."""
     rig = toed_in_rig()
