@@ -28,9 +28,9 @@ class LocusParams(Params):
     cell_size : side of a cell [m]; not set: it follows from the rig.
     extent : x_min, x_max, y_min, y_max [m] in the local frame; not set: what both cameras see well.
     max_range_cells : number of cells that a pixel may cover along the range within the automatic extent.
-    max_sigma : largest standard deviation [m], by sigma_disparity; not set: one cell size, or the one that would suit the
-        pair if that is greater and cell_size is not set; above a plane that is no ground ten times that of the median
-        match.
+    max_sigma : largest standard deviation [m], by sigma_disparity; not set: one cell size, or the one that would suit
+        the pair if that is greater and cell_size is not set; above a plane that is no ground ten times that of the
+        median match.
     max_std : largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma.
     sigma_disparity : standard deviation of a typical disparity [pixels].
     max_residual : largest residual |p_l + d - p_r| of a solution [pixels].
