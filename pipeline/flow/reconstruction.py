@@ -246,6 +246,7 @@ def tracked(
             p.resections = [s.resection for s in segments]
             return Tracked(choice, matched, segments, moved.keys())
         make.recalibrate(correction["corrected"], since)
+        knocks.clear()  # a wrong rig may look as if it was knocked
         attempt += 1
 
 
@@ -661,7 +662,7 @@ def corrected_calibration(
     """Correction of the calibration that all segments agree on, None if they need none; ``key`` gives the rig."""
     p = make.products
     fixed = make.config.rig.mode == "fixed"
-    asked = {"before": make.correction, "fixed": fixed or None}
+    asked = {"given": make.given_rig, "before": make.correction, "fixed": fixed or None}
     p.intrinsics = make.node(intrinsics_stage, "intrinsics", segments=segments, rig=key.rig, **asked)
     judged: list[Ref[IntrinsicsFacts] | None] = yield Maybe([p.intrinsics])
     facts: Any = None if judged[0] is None else judged[0].meta

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp
+from rille.stages.geometry.geometry import Rig, RigidTransform, cross_matrix, left_jacobian, rotation_exp, rotation_log
 
 NAMES = ("pitch", "yaw", "roll", "baseline_across", "baseline_forward")
 """The five parameters of a correction, in their order in vectors."""
@@ -49,6 +49,13 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
     rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
     centre, _ = _centre(rig, correction)
     return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
+
+
+def turned_along(rig: Rig, other: Rig) -> float:
+    """Angle of :func:`angle_along`, rad, by which the right camera of an ``other`` rig is turned against that of
+    ``rig``."""
+    turn = rotation_log(other.T_right_left.rotation @ rig.T_right_left.rotation.T)
+    return float(turn[NAMES.index(angle_along(rig))])
 
 
 def far_shift(rig: Rig, changed: Rig) -> Floats:

@@ -15,8 +15,8 @@ changes along the way.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -235,13 +235,15 @@ def intrinsics_stage(
     segments: Sequence[Bundle[ResectFacts]],
     rig: Bundle[CalibrationFacts],
     *,
+    given: Mapping[str, Any],
     before: Sequence[float] | None = None,
     fixed: bool = False,
 ) -> Bundle[IntrinsicsFacts]:
     """Errors of the calibration that the tracks of all segments show.
 
-    ``before`` is the correction so far; with ``fixed`` the rig keeps its yaw. The yaw is corrected first: while it is
-    wrong, the tracks mislead about the cameras.
+    ``given`` is the rig that the images of the pairs repaired to ``rig``, ``before`` the correction that led to it;
+    with ``fixed`` the rig keeps its yaw. The yaw is corrected first: while it is wrong, the tracks mislead about the
+    cameras.
     """
     parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
     information = np.array([part["information"] for part in parts]).reshape(-1, k, k)
@@ -250,8 +252,8 @@ def intrinsics_stage(
     turning = np.array([part["turn_deg"] >= 4.0 for part in parts], bool)
     straight = ~turning | (turning.sum() < MIN_SEGMENTS)
     information[straight], pull[straight] = of_toe_in(information[straight], pull[straight], params.sigma)
-    given = Rig.from_dict(rig.meta["rig"])
-    focal, upright = given.left.fx, epipolar.standing(given)
+    used = Rig.from_dict(rig.meta["rig"])
+    focal, upright = used.left.fx, epipolar.standing(used)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     common = common_errors(information, pull, params.sigma, least=MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR)
@@ -268,8 +270,10 @@ def intrinsics_stage(
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
     sigma = np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)
-    if not fixed and (turn := turn or hidden_yaw(segments, given)):
-        correction = np.array([*np.zeros(CORRECTED), turn])
+    if not fixed and (turn := turn or hidden_yaw(segments, used)):
+        # The tracks follow the repaired rig: with the given one corrected, the images have nothing left to repair.
+        repaired = epipolar.turned_along(Rig.from_dict(given), used)
+        correction = np.array([*np.zeros(CORRECTED), repaired + turn])
     facts: IntrinsicsFacts = {
         "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
@@ -281,10 +285,10 @@ def intrinsics_stage(
         "corrected": composed(made, correction).tolist(),
     }
     if parts and (made[-1] or rig.meta["changed"]):
-        facts["inverse_depth_std"] = inverse_depth_std(facts["yaw"], given.baseline)
+        facts["inverse_depth_std"] = inverse_depth_std(facts["yaw"], used.baseline)
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
-    name = epipolar.angle_along(given)
+    name = epipolar.angle_along(used)
     angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed) if off else ""
     bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name) if bent else ""
     rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0])) if late else ""

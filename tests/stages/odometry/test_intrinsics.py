@@ -127,6 +127,7 @@ def facts_from(segments, turn: float = 0.0, changed: bool = False, **known):
         part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
         parts.append(Bundle({}, {"per_frame": [], "intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}}))
     rig = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": changed})
+    known = {"given": cameras.rig.to_dict(), **known}
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
 
 
@@ -252,11 +253,12 @@ def test_two_segments_that_agree_tell_a_yaw(segments):
     assert facts["correction"][-1] == pytest.approx(-0.006 * (segments > 1), abs=0.001)
 
 
-@pytest.mark.parametrize("yaw", [0.012, -0.012])
+@pytest.mark.parametrize(("yaw", "repaired"), [(0.012, 0.0), (-0.012, 0.0), (-0.012, 0.05)])
 @pytest.mark.parametrize("refused", [4, 1])
 @pytest.mark.parametrize("centre", [(-0.12, 0.0, 0.0), (0.01, -0.12, 0.0)], ids=["side by side", "one above the other"])
-def test_a_yaw_with_which_no_frame_has_a_pose_is_corrected(yaw, refused, centre):
-    """Where most segments agree on it: one alone may have changed its focal length."""
+def test_a_yaw_with_which_no_frame_has_a_pose_is_corrected(yaw, repaired, refused, centre):
+    """Where most segments agree on it: one alone may have changed its focal length. Of the given rig, which the images
+    may have ``repaired`` by too much."""
     base, parts = RigidTransform(np.eye(3), np.array(centre)), []
     for seed in range(refused):
         tracks, _, cameras = segment(seed, CAMERA, Lens(CAMERA), 0.0, yaw, base, 0.5)
@@ -264,10 +266,11 @@ def test_a_yaw_with_which_no_frame_has_a_pose_is_corrected(yaw, refused, centre)
         points = SegmentPoints(np.stack([key, *tracks.pixels], 1), tracks.landmarks, CAMERA, LEVEL)
         parts.append({"per_frame": resect_segment(points, [0, 1, 2], PARAMS).facts, "intrinsics": {}})
     parts += [{"per_frame": [], "intrinsics": {}}] * (4 - refused)
-    given = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": False})
+    used = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": bool(repaired)})
+    given = {"given": calibrated_anew(cameras.rig, [0.0, 0.0, 0.0, -repaired]).to_dict()}
     segments = [Bundle({}, one) for one in parts]
-    facts = intrinsics_stage.run(IntrinsicsParams(), {}, {"segments": segments, "rig": given}).meta
-    assert facts["correction"][-1] == pytest.approx(-yaw * (refused > 1), rel=0.1)
+    facts = intrinsics_stage.run(IntrinsicsParams(), given, {"segments": segments, "rig": used}).meta
+    assert facts["correction"][-1] == pytest.approx((repaired - yaw) * (refused > 1), rel=0.1)
 
 
 @pytest.mark.parametrize("changed", [False, True])
