@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -246,14 +246,29 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
         "in_world": int((piece == main).sum()),
         "lost": lost,
     }
-    return facts | {"warnings": list(_missing(facts, causes))}
+    return facts | {"warnings": list(_missing(frames, facts, causes))}
 
 
-def _missing(facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:
-    """Lines on what a trajectory lacks, by the facts of :func:`account`."""
-    for one in facts["lost"]:
-        how = "no pose" if one["bridged"] is None else f"bridged from {one['bridged'][0]} to {one['bridged'][1]}"
-        yield f"frame {one['frame']} lost: {one['cause']}; {how}"
+VIEW_MOVES = "; the view moves by "
+"""Behind the cause for which a frame is lost, how far its view lies from that of the frame before."""
+
+
+def _missing(frames: Sequence[int], facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:
+    """Lines on what a trajectory of some frames lacks, by the facts of :func:`account`."""
+    place = {frame: k for k, frame in enumerate(frames)}
+
+    def alike(numbered: tuple[int, dict[str, Any]]) -> tuple[int, str, Any]:
+        # Of frames that follow each other, of one cause but for how far each view moves.
+        k, one = numbered
+        return place[one["frame"]] - k, one["cause"].partition(VIEW_MOVES)[0], one["bridged"]
+
+    for (_, cause, bridged), group in groupby(enumerate(facts["lost"]), alike):
+        first, *others = (one for _, one in group)
+        how = "no pose" if bridged is None else f"bridged from {bridged[0]} to {bridged[1]}"
+        if others:
+            yield f"frames {first['frame']}-{others[-1]['frame']} lost: {cause}; {how}"
+        else:
+            yield f"frame {first['frame']} lost: {first['cause']}; {how}"
     pieces = facts["pieces"]
     if len(pieces) > 1:
         words = ", ".join(f"piece {k}: frames {a}-{b}" for k, (a, b) in enumerate(pieces, start=1))
@@ -266,10 +281,10 @@ def _missing(facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[st
             yield f"nothing tells of the vertical at frames {a}-{b}: {world}"
 
 
-def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, list[str]]:
+def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, str]:
     """How far the view of each frame lies from that of the frame before, in words: radians and share found again."""
     return {
-        b: [f"the view moves by {math.degrees(turn):.0f} degrees from frame {a}, {share:.0%} of it is found again"]
+        b: f"{VIEW_MOVES}{math.degrees(turn):.0f} degrees from frame {a}, {share:.0%} of it is found again"
         for (a, b), (turn, share) in zip(pairwise(frames), steps, strict=True)
         if turn is not None
     }
@@ -318,7 +333,7 @@ def trajectory_stage(
     if steps is not None:
         through = [f for f in frames if f not in {int(one["frame"]) for one in lost}]
         moved = _moved(through, steps)
-        causes = {f: "; ".join([cause, *moved.get(f, ())]) for f, cause in causes.items()}
+        causes = {f: cause + moved.get(f, "") for f, cause in causes.items()}
     row = {frame: k for k, frame in enumerate(frames)}
     rows = [[row[int(f["frame"])] for f in part] for part in parts]
     found = chain(links, levels, rows, len(frames))

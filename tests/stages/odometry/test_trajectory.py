@@ -118,6 +118,13 @@ def test_a_break_says_how_far_the_view_moves_there():
     assert "(too few landmarks; the view moves by 11 degrees from frame 2, 30% of it is" in out.meta["warnings"][-1]
 
 
+def test_frames_lost_one_after_the_other_for_one_cause_are_one_line():
+    _, _, out = broken_run({4, 5}, moved=True)
+    assert [one["frame"] for one in out.meta["lost"]] == [4, 5]
+    assert "from frame 4, 30% of it" in out.meta["lost"][1]["cause"]
+    assert out.meta["warnings"][0] == "frames 4-5 lost: too few landmarks; bridged from 3 to 6"
+
+
 def test_a_frame_lost_within_a_segment_is_bridged():
     truth, levels, out = broken_run({4})
     assert out["piece"].tolist() == [0, 0, 0, 0, -1, 0, 0, 0]
