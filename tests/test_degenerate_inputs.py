@@ -40,6 +40,7 @@ RUNS = {
 }
 ELSEWHERE = {
     *(
+        "calibration.knocked",
         "calibration.swap_check",
         "calibration.synchrony",
         "evaluation.position_accuracy",
@@ -49,7 +50,8 @@ ELSEWHERE = {
         *("odometry.loops", "odometry.resection.loop", "odometry.resection.adjust"),
     ),
 }
-"""Stages that need a lens, positions, a map, disparities, a doubt or a place seen again: tested with their modules."""
+"""Stages that need a lens, positions, a map, disparities, a doubt, a knock or a place seen again: their modules have
+tests."""
 
 AMOUNTS = {"nothing": 0, "one": 1, "few": 3}
 POINTS = ("point", "block", "match", "vertex")
