@@ -25,8 +25,10 @@ from rille.stages.core.errors import InputError, warning
 from rille.stages.core.quantities import count
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
-STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
-"""Beginnings of files with records of another form: GPX and KML are XML."""
+STRUCTURED = re.compile(
+    r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>(?:[\d.:TZ-]+[\s,;]+)?\$[A-Z]{5},))"
+)
+"""Beginnings of files with records of another form: GPX and KML are XML; a logger writes its time before NMEA's."""
 
 ROWS = (
     "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
@@ -176,6 +178,8 @@ def read_table(path: Path, what: str) -> TextTable:
         text = f"{what} {path} has no rows that begin with a number{last}"
         raise InputError("RIL-286", text, remedy="check that it is the right file; dates are as 2026-05-31 12:00:00")
     header = split(names, separator, columns)
+    if "".join(header[:1]).lower() in ("gpst", "utc") and len(header) == columns - 1:  # RTKLIB's week, and its seconds
+        header = ("week", *header)
     header = header if len(header) == columns else _of_places(names, columns)
     if len(units) == columns:
         header = tuple(f"{n} [{u.strip('[]()')}]" if u else n for n, u in zip(header, units, strict=False))
@@ -200,7 +204,7 @@ def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]
 
     Without a separator, cells are separated by blanks, or by tabs alone if that makes ``columns`` cells.
     """
-    if separator is None and len(text.split()) != columns == text.count("\t") + 1:
+    if separator is None and "\t" in text and len(text.split()) != columns == text.count("\t") + 1:
         separator = "\t"
     cells = [cell.strip().strip("\"'").strip() for cell in text.split(separator)]
     return tuple(cells[:-1] if separator and len(cells) not in (1, columns) and not cells[-1] else cells)

@@ -32,12 +32,17 @@ SPELT = (
     ("ft", "feet|foot"),
     ("in", "inch(es)?"),
     ("yd", "yards?"),
+    *(
+        (symbol, f"{spelt}s(ec(ond)?s?)?")
+        for symbol, spelt in (("ms", "m(illi)?"), ("us", "(u|micro)"), ("ns", "n(ano)?"))
+    ),
+    ("s", "sec(ond)?s?"),
 )
 """Symbols of units, and their other spellings."""
 
 STATED = re.compile(
     r"[\[(](.*?)[\])]"
-    r"|[_ ]((?:[mun]?s|[muckd]?m|ft|in|inch|yd)(?:[_/]s2?)?$|(?:m?rad|deg|gon|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
+    r"|[_ ]((?:[mun]?s(?:ec)?|[muckd]?m|ft|in|inch|yd)(?:[_/]s2?)?$|(?:m?rad|deg|gon|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
 )
 """Unit in the name of a column: in brackets, or at its end; of turns also before the axis."""
 

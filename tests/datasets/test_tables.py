@@ -64,7 +64,9 @@ def test_rows_in_which_nothing_was_measured_are_counted(tmp_path, separator):
 
 
 def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
-    assert table(tmp_path, "# recorded in the yard\n1 2 3\n").header == ()
+    for remark in ("recorded in the yard", "groundtruth"):
+        read = table(tmp_path, f"# {remark}\n1 2 3\n")
+        assert (read.header, read.columns) == ((), 3)
 
 
 def test_a_name_may_stand_first_in_a_row(tmp_path):
@@ -115,6 +117,7 @@ def test_names_in_brackets_are_no_json(tmp_path):
         ("[\n  [1, 2, 3],\n  [4, 5, 6]\n]\n", ("RIL-979", "JSON")),
         ('\n<?xml version="1.0"?>\n<gpx>\n</gpx>\n', ("RIL-979", "XML")),
         ("$GPGGA,122640,4900.03,N,824.1,E\n$GPRMC,122640,A\n", ("RIL-979", "NMEA")),
+        ("1600000000.5 $GNGGA,122640,4900.03,N,824.1,E\n", ("RIL-979", "NMEA")),
         ("time,x\n2020-09-13,1\n", ("RIL-286", "t.csv", "'2020-09-13,1'")),
     ],
 )
