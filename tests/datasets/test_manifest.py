@@ -730,6 +730,7 @@ def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, fil
         ({"text": '[world]\ncrs = "EPSG:32633"\n'}, ("RIL-223", "azimuth_deg")),
         ({"text": "[world]\nup = [0, 0, 0]\n"}, ("RIL-223", "world.up", "0")),
         ({"text": "[vehicle]\nmax_step = 0.5\n"}, ("RIL-223", "max_step", "0.5", "0.2")),
+        ({"text": "[vehicle]\nwidth = 0.5\n"}, ("RIL-223", "cameras.width", "known here are clearance", "track")),
         ({"text": "[vehicle]\nmax_steps = 0.5\n"}, ("RIL-223", "'vehicle.max_steps'", "mean vehicle.max_step?")),
     ],
 )
