@@ -9,9 +9,10 @@ from __future__ import annotations
 import glob
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -211,19 +212,22 @@ def _relative(path: Path, folder: Path) -> str:
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
+Named = dict[tuple[int, str], list[tuple[str, int, Path]]]
+"""Names without the side's token, side and path of images by the number of the token and their folder without it."""
+
 Sets = dict[tuple[int, str], tuple[list[Path], list[Path]]]
 """Left and right images by the number of the tokens in their names (``SIDES``), and their place."""
 
 
 def _by_token(images: list[Path], names: list[str]) -> Sets:
     """Images whose names have a side's token, in sets of one place; a set may have one side alone."""
-    named: dict[tuple[int, str], list[tuple[str, int, Path]]] = defaultdict(list)
+    named: Named = defaultdict(list)
     groups: Sets = defaultdict(lambda: ([], []))
     for path, name in zip(images, names, strict=True):
         if (at := side_of(name)) is not None:
             row, side, neutral = at
-            named[row, _place(path, neutral)].append((neutral, side, path))
-    for (row, place), found in named.items():
+            named[row, neutral.rpartition("/")[0]].append((neutral, side, path))
+    for (row, place), found in _of_one_kind(named):
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
@@ -316,9 +320,19 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 
-def _place(path: Path, without: str) -> str:
-    """Place of a set's file: its folder without the side's token, and its kind."""
-    return f"{without.rpartition('/')[0]} {path.suffix.lower()}"
+def _of_one_kind(named: Named) -> Iterator[tuple[tuple[int, str], list[tuple[str, int, Path]]]]:
+    """Images of one place and kind, or of several kinds in turns (1.png, 2.jpg, 3.png), with the place's name."""
+    for (row, place), found in named.items():
+        kinds = defaultdict(list)
+        for neutral, side, path in found:
+            kinds[path.suffix.lower()].append((neutral, side, path))
+        row_of_kinds = [path.suffix.lower() for _, _, path in sorted(found, key=lambda of: (of[1], natural(of[0])))]
+        changes = sum(a != b for a, b in pairwise(row_of_kinds))
+        shapes = {re.sub(r"\d+", "", neutral) for neutral, _, _ in found}
+        # Of two kinds with the same names one is made of the other; of a few of another kind nothing is known.
+        in_turns = len({of[:2] for of in found}) == len(found) and len(shapes) == 1 and changes > 2 * len(kinds)
+        for kind, of_kind in [("", found)] if in_turns else kinds.items():
+            yield (row, f"{place} {kind}"), of_kind
 
 
 def pattern(paths: list[Path], folder: Path) -> str:
@@ -333,6 +347,8 @@ def pattern(paths: list[Path], folder: Path) -> str:
         return place + glob.escape(names[0])
     head = _common_start(names).rstrip("0123456789")
     tail = _common_start([name[len(head) :][::-1] for name in names])[::-1].lstrip("0123456789")
+    if len({path.suffix.lower() for path in paths}) > 1:  # *g of .png and .jpg
+        tail = ""
     return f"{place}{glob.escape(head)}*{glob.escape(tail)}"
 
 

@@ -338,6 +338,14 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     assert "left/3.jpg" in told
 
 
+def test_kinds_of_images_in_turns_are_one_set(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "3", "5"]) + both("{side}/{name}.jpg", ["2", "4"]))
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs, views.others) == ("left/*", "right/*", 5, ())
+    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "3", "5"]))  # each png once more, as a jpg
+    assert inspect(tmp_path).views.pairs == 5
+
+
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
     write_images(tmp_path, days)
