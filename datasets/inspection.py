@@ -30,6 +30,7 @@ from rille.datasets.poses import (
     matrix_at,
     meanings,
     of_images,
+    of_photographs,
     of_poses,
     positions_of,
     untimed,
@@ -452,7 +453,7 @@ def table_kind(path: Path, pairs: int) -> str:
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
-    if "yaw" in header and "roll" in header and not table.crs:
+    if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
     if untimed(table) and len(table.rows) == pairs:
         return "truth"

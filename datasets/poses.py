@@ -315,8 +315,8 @@ def positions_of(
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
     posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
-    # Beside degrees nothing says in which frame angles are.
-    if not columns and posed and not table.crs:
+    # Beside degrees, and names of images, nothing says in which frame angles are.
+    if not columns and posed and not (table.crs or of_photographs(table)):
         return None
     degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
     if len(known) < 2 or (degrees and not table.crs):
@@ -421,6 +421,20 @@ def meanings(table: TextTable) -> dict[str, int]:
     if table.crs and "x" not in columns:
         columns |= _geocentric(table)
     return columns
+
+
+def of_photographs(table: TextTable) -> bool:
+    """Whether rows are places of images by name, with angles, as Metashape and Pix4D write them."""
+    meant = meanings(table)
+    by_name = {"x", "y", *ANGLES} <= meant.keys() and not {"time", *QUATERNION} & meant.keys()
+    return by_name and bool(np.isinf(table.values([0])).all())
+
+
+def columns_of_places(table: TextTable) -> dict[Any, str | int]:
+    """Numbers (from 1) of the columns that their names make those of positions, of poses too; none without x and y."""
+    meant = meanings(table)
+    named = {name: k + 1 for name, k in meant.items() if name in ("time", *POSITION)}
+    return dict(named) if {"x", "y"} <= meant.keys() else {}
 
 
 def _geocentric(table: TextTable) -> dict[str, int]:

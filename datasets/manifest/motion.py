@@ -22,6 +22,7 @@ from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import (
     TimedPoses,
     TimedPositions,
+    columns_of_places,
     coverage,
     interpolate,
     poses_of,
@@ -343,7 +344,8 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        found = positions_of(read_motion(self.root / section.file, crs=self.crs), "auto", section.columns, section.unit)
+        table = read_motion(self.root / section.file, crs=self.crs)
+        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")

@@ -240,6 +240,7 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["time,latitude,longitude,altitude", "0,48,9,2"], "positions"),
         (["time,lat,lon,alt,roll,pitch,yaw", "0,48,9,2,0.1,0.2,3"], "positions"),
         (["#Label,X/Longitude,Y/Latitude,Z/Altitude", *(f"0{k}.jpg,9,48,2" for k in range(4))], "positions"),
+        (["#Label,X/Easting,Y/Northing,Z,Yaw,Pitch,Roll", *(f"{k}.jpg,9,8,2,1,2,3" for k in range(4))], "positions"),
         (["image,easting,northing", *(f"img_{k}.jpg,9,48" for k in range(4))], "positions"),
         (["east north", "1 2", "3 4"], "positions"),
         (["east north", "1 2", "3 4", "5 6"], ""),
@@ -608,6 +609,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "d.npy",
         "left/3.heic",
         "r.raw",
+        "cameras.bin",
         "nav.IMG",
         "notes.md",
         "more.pdf",
@@ -627,6 +629,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "1 array (d.npy): python -c",
         "1 image (left/3.heic): ",
         "1 bag (drive.bag)",
+        "1 COLMAP file (cameras.bin): colmap model_converter",
         "1 matrix file (s.npz): if it is the calibration, write it as text",
     ):
         assert words in text
@@ -635,7 +638,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
     assert "gps.txt is NMEA, no table" in text
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
-    assert len(found.unread) == 11
+    assert len(found.unread) == 12
     assert all(f"# Not read: {line}" in manifest_text(found, ".") for line in found.unread)
 
 

@@ -955,6 +955,20 @@ def test_positions_by_names_of_images(tmp_path, lines, xs, times):
         opened(path)
 
 
+def test_positions_may_be_those_of_poses_with_names(tmp_path):
+    write_lines(tmp_path / "p.csv", ["time,x,y,z,qx,qy,qz,qw", *(f"{k},{k},{10 * k},0,0,0,0,1" for k in range(3))])
+    s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
+    assert s.priors["positions"]["positions"] == [[0, 0, 0], [1, 10, 0], [2, 20, 0]]
+
+
+def test_angles_of_photographs_are_told_and_their_places_are_truth(tmp_path):
+    lines = ["#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll", *(f"{k:02d}.png,{k},5,0,1,2,3" for k in range(3))]
+    write_lines(tmp_path / "p.txt", lines)
+    s = opened(write_sequence(tmp_path, '[truth]\nfile = "p.txt"\n'))
+    assert [row[0] for row in s.truth_positions.positions] == [0, 1, 2]
+    assert [line for line in s.warnings if "RIL-749" in line and "yaw, pitch, roll" in line]
+
+
 def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):
     write_lines(tmp_path / "wheels.tum", [tum(k, 0.1 * k) for k in range(3)])
     s = opened(write_sequence(tmp_path, TIMED + '[odometry]\nfile = "wheels.tum"\n'))
