@@ -35,7 +35,7 @@ from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
 from rille.datasets.text.units import unit_of
-from rille.stages.core.errors import IncompleteError, InputError
+from rille.stages.core.errors import IncompleteError, InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
@@ -46,6 +46,9 @@ TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
 
 TIME = re.compile("time|stamp", re.IGNORECASE)
 """Part of the title of a column of times."""
+
+FEWEST_POSITIONS = 3
+"""Positions that place a trajectory."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
@@ -350,6 +353,11 @@ class MotionReader:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
         places, times = self.positions(section, found, "positions")
+        at = self.sequence.times or ()
+        there = sum(at[0] <= t <= at[-1] for t in times) if times and at else FEWEST_POSITIONS
+        if there < FEWEST_POSITIONS <= min(len(places), len(at)):
+            text = f"{section.file}: {there} of its {len(places)} positions are of the time of the frames"
+            self.warn((warning("RIL-797", f"{text}: check its clock, and the unit of its times (time_ms)"),))
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
         measured = {
             "positions": [list(place) for place in places],

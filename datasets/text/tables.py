@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -76,17 +77,18 @@ class TextTable:
         return np.array([[_number(row[column]) for column in columns] for row in self.rows])
 
     def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, tuple[str, ...]]:
-        """The table without rows that lack a value in a column, or are ``lost``, and a warning with their number.
+        """The table without rows that lack a value in a column, repeat the row before, or are ``lost``, and a warning.
 
         If no row would be left, all are kept, and their reader reports the error.
         """
-        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | lost)
+        repeated = np.array([False, *(row == before for before, row in pairwise(self.rows))])
+        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | repeated | lost)
         if missing.all() or not missing.any():
             return self, ()
         kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
         rows, lines = zip(*kept, strict=True)
-        text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement left out"
-        text += f", the first in line {self.lines[int(missing.argmax())]}"
+        text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement of their own"
+        text += f" left out, the first in line {self.lines[int(missing.argmax())]}"
         return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
     def measures(self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None) -> Floats:

@@ -955,6 +955,14 @@ def test_positions_by_names_of_images(tmp_path, lines, xs, times):
         opened(path)
 
 
+@pytest.mark.parametrize(("step", "told"), [(1, False), (1000, True)])
+def test_positions_of_another_unit_of_time_are_doubted(tmp_path, step, told):
+    write_lines(tmp_path / "p.csv", ["time,x,y", *(f"{k * step},{k},0" for k in range(3))])
+    s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
+    assert [line for line in s.warnings if "RIL-797" in line and "1 of its 3" in line] == list(s.warnings)
+    assert bool(s.warnings) == told
+
+
 def test_positions_may_be_those_of_poses_with_names(tmp_path):
     write_lines(tmp_path / "p.csv", ["time,x,y,z,qx,qy,qz,qw", *(f"{k},{k},{10 * k},0,0,0,0,1" for k in range(3))])
     s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))

@@ -63,6 +63,13 @@ def test_rows_in_which_nothing_was_measured_are_counted(tmp_path, separator):
     assert t.measured([0], lost=True) == (t, ())
 
 
+def test_rows_that_were_written_twice_count_once(tmp_path):
+    """As messages of ROS; another position at the same time stays, and is refused with its line."""
+    kept, lines = table(tmp_path, "time,x,y\n1,2,3\n1,2,3\n2,2,3\n2,2,4\n").measured([0, 1, 2])
+    assert (kept.lines, len(lines)) == ((2, 4, 5), 1)
+    assert "RIL-706" in lines[0]
+
+
 def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
     for remark in ("recorded in the yard", "groundtruth"):
         read = table(tmp_path, f"# {remark}\n1 2 3\n")
