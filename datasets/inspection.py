@@ -385,7 +385,10 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             names = (chosen[0].name, chosen[1].name)
             candidates.append(replace(_calibration((name,), chosen), names=names))
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
-    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairing.two_sides(single)]
+    # Cameras of other names differ by the same words as their images.
+    renamed = {name: _of_other_side(name, found.views.sides) for name in single}
+    pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
+    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairs]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
         place = Path(found.views.left).parent
@@ -402,6 +405,11 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
         unlike = [name for name in each if len(each) == found.views.pairs and str(read[name]) != str(read[taken[0]])]
         remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
         found.unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
+
+
+def _of_other_side(name: str, sides: tuple[str, str]) -> str:
+    """The name of a file of the left camera with the right one's word in the place of its own; else as it is."""
+    return "".join(sides[1] if word == sides[0] else word for word in re.split(r"([^\W_]+)", name))
 
 
 def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
@@ -463,6 +471,9 @@ def table_kind(path: Path, pairs: int) -> str:
     # Without times or names of images there must be one for each pair.
     if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
+    images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
+    if images and "time" in meanings(table) and len(table.rows) == pairs:
+        return "times"
     # Names of images, dates and the like are no numbers.
     return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
 

@@ -245,6 +245,7 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["east north", "1 2", "3 4"], "positions"),
         (["east north", "1 2", "3 4", "5 6"], ""),
         (["0.0", "0.5"], "times"),
+        (["# id timestamp image_name", "0 1600000000.1 a.png", "1 1600000000.2 b.png"], "times"),
         (["0.0", "0.5", "1.0"], ""),
         (["00000 1600000000.1 5.0", "00001 1600000000.2 5.0"], ""),
         (["hello", "1 of these"], ""),
@@ -439,13 +440,14 @@ def test_a_calibration_in_millimetres_opens_once_its_unit_is_said(tmp_path):
     assert open_manifest(path, Digests()).rig.baseline == pytest.approx(0.12)
 
 
-def test_two_files_are_left_and_right(tmp_path):
-    write_images(tmp_path, ["left4.png", "right4.png"])
-    for side, x in (("left", 0.0), ("right", 0.1)):
-        (tmp_path / f"cam_{side}.tsai").write_text(TSAI.format(x=x))
+@pytest.mark.parametrize(("left", "right"), [("left", "right"), ("cam2", "cam3"), ("port", "starboard")])
+def test_two_files_are_left_and_right(tmp_path, left, right):
+    write_images(tmp_path, [f"{side}/{k}.png" for side in (left, right) for k in (4, 5, 6)])
+    for side, x in ((left, 0.0), (right, 0.1)):
+        (tmp_path / f"of_{side}.tsai").write_text(TSAI.format(x=x))
     found = inspect(tmp_path)
     assert found.calibration is not None
-    assert found.calibration.files == ("cam_left.tsai", "cam_right.tsai")
+    assert found.calibration.files == (f"of_{left}.tsai", f"of_{right}.tsai")
     assert found.calibration.baseline == pytest.approx(0.1)
     text = manifest_text(found, ".")
     assert needs(text) == []

@@ -134,6 +134,11 @@ def test_what_is_wrong_names_the_line(tmp_path, text, expected):
     assert caught.value.remedy
 
 
+def test_a_last_row_that_was_cut_off_is_left_out(tmp_path):
+    """As by a recorder that was switched off."""
+    assert table(tmp_path, "time,x,y\n1,2,3\n4,5").rows == (("1", "2", "3"),)
+
+
 def test_a_missing_or_binary_file(tmp_path):
     with raises("RIL-138"):
         read_table(tmp_path / "none.csv", "table")
