@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import re
+import shlex
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +22,7 @@ from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
-from rille.datasets.images.headers import sizes_of
+from rille.datasets.images.headers import located, sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
@@ -152,7 +153,7 @@ def inspect(folder: Path) -> Findings:
             raise InputError(error.code, text, remedy="; ".join(lines)) from error
         raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
-    found.unread += found.views.others
+    found.unread += [*found.views.others, *_places_in_images(found.views.left, folder, search)]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
@@ -179,6 +180,15 @@ def inspect(folder: Path) -> Findings:
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
     return found
+
+
+def _places_in_images(left: str, folder: Path, search: Search) -> list[str]:
+    """A line on places in EXIF of left images, and how they become a table; empty if there are none."""
+    sample = search.matching(folder, left)[:MOST_TEXTS]
+    places = sum(map(located, sample))
+    export = f"exiftool -csv -n -GPSLatitude -GPSLongitude -GPSAltitude {shlex.quote(str(Path(left).parent))} > gps.csv"
+    text = f"places in EXIF of {places} of {count(len(sample), 'left image')}: `{export}`, and [positions] of that file"
+    return [text] if places else []
 
 
 def _of_cameras(path: Path) -> bool:

@@ -74,9 +74,18 @@ WORDS = (
     # RTKLIB has baselines from the reference station, Metashape X/Easting, PlotJuggler /fix/altitude.
     (re.compile(r"(?:utm[_. ]?|.*/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?|.*/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
-    (re.compile(r"(?:.*[./])?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"), lambda m: "z"),
-    (re.compile(r"(?:.*[./_ ])?lat(?:itude)?"), lambda m: "lat"),
-    (re.compile(r"(?:.*[./_ ])?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
+    # Gauss-Krueger's names, and EXIF's.
+    (re.compile(r"rechtswert"), lambda m: "x"),
+    (re.compile(r"hochwert"), lambda m: "y"),
+    (re.compile(r"h|hoehe|h\N{LATIN SMALL LETTER O WITH DIAERESIS}he|elev"), lambda m: "z"),
+    (
+        re.compile(
+            r"(?:.*[./]|(?:gps|gnss|wgs84|utm)[_ ]?)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"
+        ),
+        lambda m: "z",
+    ),
+    (re.compile(r"(?:.*[./_ ]|gps)?lat(?:itude)?"), lambda m: "lat"),
+    (re.compile(r"(?:.*[./_ ]|gps)?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
 )
 
 DOWNWARDS = re.compile(r"(.*[./])?(down|depth|d)")

@@ -309,7 +309,7 @@ class MotionReader:
     def positions(
         self, section: Truth | PositionFile, found: TimedPositions, table: str
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
-        """Positions in metres, and their times (s) by the images' clock; None: one for each pair.
+        """Positions in metres, and their times (s) by the images' clock, or numbers of pairs; None: one for each pair.
 
         Rows that begin with names of images are those of the left images of these names.
 
@@ -325,7 +325,9 @@ class MotionReader:
             return found.positions, times
         rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
-        clock = None if len(at) == len(self.pairs) else self.sequence.times
+        # Measurements may be of numbers of pairs.
+        numbers = tuple(map(float, range(len(self.pairs)))) if table == "positions" else None
+        clock = None if len(at) == len(self.pairs) else self.sequence.times or numbers
         if at and (clock or len(at) == len(self.pairs)):
             return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
         of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
@@ -399,7 +401,8 @@ def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[in
     """
 
     def parts(name: str) -> tuple[str, ...]:
-        return tuple(re.split(r"[/\\]", name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name))
+        stem = name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name
+        return tuple(re.split(r"[/\\]", stem.removeprefix("./")))
 
     known = {parts(name): row for row, name in enumerate(names)}
     paths = [parts(str(pair.left)) for pair in pairs]

@@ -200,7 +200,11 @@ def _of_places(names: str, columns: int) -> tuple[str, ...]:
 
 def _named(row: tuple[str, ...], columns: int) -> bool:
     """Whether numbers follow a name, as that of a vehicle or of an image, in as many cells as there are names."""
-    return len(row) == columns and row[0][:1].isalnum() and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
+    return (
+        len(row) == columns
+        and re.match(r"[\w./]", row[0]) is not None
+        and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
+    )
 
 
 def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:

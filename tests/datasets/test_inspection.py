@@ -340,6 +340,17 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     assert "left/3.jpg" in told
 
 
+def test_places_in_images_become_a_table(tmp_path):
+    from PIL import Image
+
+    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "2", "3"]))
+    place = Image.Exif()
+    place.get_ifd(0x8825).update({1: "N", 2: (48.0, 6.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.0)})
+    for name in ("1", "2"):
+        Image.new("L", SIZE).save(tmp_path / f"left/{name}.jpg", exif=place)
+    assert any("EXIF of 2 of 3 left images" in line and "exiftool" in line for line in inspect(tmp_path).unread)
+
+
 def test_kinds_of_images_in_turns_are_one_set(tmp_path):
     write_images(tmp_path, both("{side}/{name}.png", ["1", "3", "5"]) + both("{side}/{name}.jpg", ["2", "4"]))
     views = inspect(tmp_path).views

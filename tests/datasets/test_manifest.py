@@ -941,6 +941,7 @@ NAMED = ["left/02.png,3,30", "left/00.png,1,10", "right/01.png,9,9", "left/01.pn
         ([line.replace("/", "\\").replace(".png", "") for line in NAMED], [1, 2, 3], None),
         ([line.replace("left/", "") for line in NAMED if "right" not in line], [1, 2, 3], None),
         ([*NAMED[:2], "left/01.png,,"], [1, 3], [0, 2]),
+        ([f"./{line}" for line in NAMED[:2]], [1, 3], [0, 2]),
     ],
 )
 def test_positions_by_names_of_images(tmp_path, lines, xs, times):
@@ -949,6 +950,8 @@ def test_positions_by_names_of_images(tmp_path, lines, xs, times):
     text = '[positions]\nfile = "gnss.csv"\nsigma = 0.5\n'
     path = write_sequence(tmp_path, f"{TIMED if times else ''}{text}")
     found = opened(path).priors["positions"]
+    assert ([row[0] for row in found["positions"]], found["times"]) == (xs, times or [0, 1, 2])
+    found = opened(write_sequence(tmp_path, text)).priors["positions"]  # by numbers of pairs
     assert ([row[0] for row in found["positions"]], found["times"]) == (xs, times or [0, 1, 2])
     write_lines(tmp_path / "gnss.csv", ["image,easting,northing", *(f"other/{k}.png,1,2" for k in range(3))])
     with raises("RIL-803", "0 positions by names of left images for 3 pairs"):

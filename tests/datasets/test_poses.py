@@ -330,10 +330,20 @@ def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
     np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
 
 
-def test_heights_of_a_topic_are_read(tmp_path):
-    (tmp_path / "p.csv").write_text(
-        "%time,field.latitude,field.longitude,field.altitude\n0,48.1,9.0,500\n1,48.2,9.0,501\n"
-    )
+@pytest.mark.parametrize(
+    "names",
+    [
+        "%time,field.latitude,field.longitude,field.altitude",
+        "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude",
+        "image,wgs84_lat,wgs84_lon,wgs84_alt",
+        "Bild;Hochwert;Rechtswert;H\N{LATIN SMALL LETTER O WITH DIAERESIS}he",
+        "point,N,E,H",
+    ],
+)
+def test_heights_are_read_by_their_names(tmp_path, names):
+    """Of ROS, EXIF (by exiftool), and surveyors."""
+    rows = "0,48.1,9.0,500\n1,48.2,9.0,501\n".replace(",", ";" if ";" in names else ",")
+    (tmp_path / "p.csv").write_text(f"{names}\n{rows}", encoding="utf-8")
     assert [place[2] for place in positions_of(read_motion(tmp_path / "p.csv"), "auto", {}).positions] == [500, 501]
 
 
