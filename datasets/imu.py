@@ -134,7 +134,7 @@ def names_sensors(table: TextTable) -> bool:
 
 
 def _named(table: TextTable, starts: re.Pattern[str]) -> list[int]:
-    """The three columns whose names begin so, in the order of axes that their ends tell; empty if there are not three."""
+    """The three columns whose names begin so, in the order of axes that their ends tell; empty if there are not 3."""
     found = {k: unitless(name)[-1:] for k, name in enumerate(table.header) if starts.match(name)}
     columns = sorted(found, key=found.__getitem__) if sorted(found.values()) == list("xyz") else list(found)
     return columns if len(columns) == 3 else []

@@ -147,7 +147,7 @@ class MotionReader:
         if self.growing and not path.read_bytes().endswith(b"\n"):  # the last line is still being written
             del lines[-1:]
         header, found = tuple[str, ...](), list[tuple[list[str], int]]()
-        images, by_name = False, dict[str, int]()
+        images, by_name, widest = False, dict[str, int](), tuple[str, ...]()
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
             cells = split(text.removeprefix("#"), next((s for s in ",;\t" if s in text), None))
@@ -158,13 +158,15 @@ class MotionReader:
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
             stated = [cell for title, cell in titles.items() if TIME.search(title)]
-            images = images or bool(names)
+            images, widest = images or bool(names), max(widest, cells, key=len)
             by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(found) for cell in names or cells[1:2]}
             times = [cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]]
             found.append((times, k))
         if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells, _ in found):
             found = [([of_two(*cells)], k) for cells, k in found]
-        units = [unit_of(title) for title in header if TIME.search(title)]
+        # Over a single column blanks part no titles: time [ms].
+        titles_of = header if len(widest) > 1 else (" ".join(header),)
+        units = [unit_of(title) for title in titles_of if TIME.search(title)]
         unit = next((stated for stated in units if stated in UNITS), "auto")
         column = int(_counts([cells for cells, _ in found]))
         rows = [(cells[column], k) for cells, k in found]

@@ -313,6 +313,8 @@ def test_the_title_of_a_column_of_times_states_their_unit(tmp_path):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", ["time_ms,image", "0,00.png", "500,01.png", "1000,02.png"])
     assert opened(path).times == (0.0, 0.5, 1.0)
+    write_lines(tmp_path / "t.txt", ["time [msec]", "0", "500", "1000"])
+    assert opened(path).times == (0.0, 0.5, 1.0)
     write_lines(path, [path.read_text() + 'unit = "s"'])
     assert opened(path).times == (0.0, 500.0, 1000.0)
 
@@ -329,6 +331,8 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
     for head in ([], ["# secs nsecs"]):
         write_lines(tmp_path / "t.txt", [*head, "1400000000 900000000", "1400000002 0", "1400000003 100000000"])
         assert opened(path).times == pytest.approx((1400000000.9, 1400000002.0, 1400000003.1), abs=1e-6)
+    write_lines(tmp_path / "t.txt", ["sec,nanosec", "1400000000,900000000", "1400000002,0", "1400000003,100000000"])
+    assert opened(path).times == pytest.approx((1400000000.9, 1400000002.0, 1400000003.1), abs=1e-6)
 
 
 def test_a_table_of_other_images_is_refused(tmp_path):
