@@ -175,7 +175,7 @@ def projected(table: TextTable, crs: str) -> TextTable:
 
     transform: Any = warp.transform
     of_earth = table.values(at or [meant["lon"], meant["lat"]])
-    there = np.isfinite(of_earth).all(axis=1) & of_earth.any(axis=1)
+    there = np.asarray(np.isfinite(of_earth).all(axis=1) & of_earth.any(axis=1))
     if at:
         of_earth[there] = np.transpose(transform("EPSG:4978", "EPSG:4979", *of_earth[there].T))
     at = at or [meant["lon"], meant["lat"]]

@@ -164,7 +164,7 @@ class StereoPair:
 
     def _mark(self, camera: str) -> int:
         """Checksum of an image, by which a disparity of others is known."""
-        return zlib.crc32(np.ascontiguousarray(self._bundle(camera)["image"]))
+        return zlib.crc32(np.asarray(self._bundle(camera)["image"]).tobytes())
 
 
 def open(path: str | Path, **settings: Settings) -> StereoSequence:
