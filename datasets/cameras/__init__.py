@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
+from yaml import YAMLError
+
 from rille.datasets.cameras import boofcv, colmap, kitti, makers, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
@@ -103,7 +105,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
         fields = Fields(parse_nested(text, str(path)), str(path))
     except InputError as error:
         # Only of a file that should be YAML a parser's words help.
-        if error.code != "RIL-141" or path.suffix.lower() in (".yaml", ".yml", ".json"):
+        if not isinstance(error.__cause__, YAMLError) or path.suffix.lower() in (".yaml", ".yml", ".json"):
             raise
         fields = Fields({}, str(path))
     for knows, read_fields in NESTED:

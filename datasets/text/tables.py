@@ -87,8 +87,9 @@ class TextTable:
             return self, ()
         kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
         rows, lines = zip(*kept, strict=True)
-        text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement of their own"
-        text += f" left out, the first in line {self.lines[int(missing.argmax())]}"
+        rows_left_out = count(int(missing.sum()), "row")
+        text = f"{self.name}: {rows_left_out} of {len(missing)} without a measurement of their own left out"
+        text += f", the first in line {self.lines[int(missing.argmax())]}"
         return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
     def measures(self, columns: Sequence[int], units: Mapping[str, float], unit: float | None = None) -> Floats:
