@@ -56,6 +56,13 @@ Settings = Mapping[str, Any]
 Known = dict[Handle, Bundle]
 
 
+ELSEWHERE: Mapping[str, str] = {
+    "column_disparity": "; disparities of another program are read by [disparity] of a manifest",
+    "elevation": "; rille.reconstruct(..., vehicle={...}) judges the terrain of a run anew",
+}
+"""Where data of another origin than the step before are taken, by the variable of that step."""
+
+
 @dataclass(frozen=True)
 class StereoSequence:
     """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are.
@@ -659,7 +666,8 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
         same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
         lacking += [] if all(same) else ["x and y of all its cells, as they were"]
     if lacking:
-        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"give what {maker} returns, whole")
+        remedy = f"give what {maker} returns, whole{ELSEWHERE.get(variable, '')}"
+        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=remedy)
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
     # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
     for array in stage.outputs:

@@ -209,7 +209,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         (lambda data: rille.terrain(data, pair), pair.left, "rille.match"),
         (rille.hazards, disparity, "rille.terrain"),
         (rille.path, dem, "rille.hazards"),
-        (rille.hazards, np.zeros((3, 3)), "rille.terrain"),
+        (rille.hazards, np.zeros((3, 3)), "rille.reconstruct(..., vehicle="),
+        (lambda data: rille.points(data, pair), np.zeros((260, 285)), "[disparity] of a manifest"),
     ):
         with raises("RIL-864", maker):
             step(other)
