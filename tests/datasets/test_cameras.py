@@ -635,6 +635,11 @@ def test_a_pose_under_another_key_is_refused_beside_matrices_too(tmp_path, state
         read_cameras(written(tmp_path, json.dumps(stated)))
 
 
+@pytest.mark.parametrize("key", ["IMU.T_b_c1", "Tbc", "cam_to_velodyne"])
+def test_a_pose_among_other_sensors_is_no_pose_of_two_cameras(tmp_path, key):
+    assert len(read_cameras(written(tmp_path, json.dumps(ONE | {key: T44})))) == 1
+
+
 def test_rotations_of_rectification_state_the_pose_where_nothing_else_does(tmp_path):
     P = [[500, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 0]]
     turned = [ROTATION.tolist(), np.eye(3).tolist()]
