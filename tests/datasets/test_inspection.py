@@ -92,7 +92,7 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
 
 
-@pytest.mark.parametrize("name", ["{k}/{side}.png", "{k}/{side}/x.png", "{side}/{k}/x.png"])
+@pytest.mark.parametrize("name", ["{k}/{side}.png", "{k}/{side}_{k}.png", "{k}/{side}/x.png", "{side}/{k}/x.png"])
 def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path, name):
     write_images(tmp_path, [name.format(k=k, side=side) for k in (9, 10, 11) for side in ("left", "right")])
     views = inspect(tmp_path).views
