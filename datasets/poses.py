@@ -88,7 +88,7 @@ WORDS = (
     (re.compile(r"(?:.*[./_ ]|gps)?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
 )
 
-DOWNWARDS = re.compile(r"(.*[./])?(down|depth|d)")
+DOWNWARDS = re.compile(r"(.*[./])?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
 
@@ -276,7 +276,9 @@ def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> 
 
 def _lengths(table: TextTable, columns: Sequence[int], unit: float | None) -> Floats:
     """Coordinates (n, columns), m; the sign of those that count downwards is changed."""
-    signs = [-1.0 if table.header and DOWNWARDS.fullmatch(unitless(table.header[k])) else 1.0 for k in columns]
+    bare = [unitless(name) for name in table.header]
+    down = {k for k, name in enumerate(bare) if DOWNWARDS.fullmatch(name) or (name == "d" and {"e", "n"} <= set(bare))}
+    signs = [-1.0 if k in down else 1.0 for k in columns]
     return table.measures(columns, units.LENGTHS, unit) * signs
 
 

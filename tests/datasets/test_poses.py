@@ -355,6 +355,11 @@ def test_positions_that_count_downwards_are_turned_upwards(tmp_path):
         assert found.positions == ((2.0, 5.0, -3.0), (2.0, 6.0, -3.5))
 
 
+def test_a_column_called_d_counts_downwards_beside_north_and_east_alone(tmp_path):
+    (tmp_path / "p.csv").write_text("time,d,y\n0,5,2\n1,6,2\n")
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {"x": "d"}).positions == ((5.0, 2.0), (6.0, 2.0))
+
+
 def test_positions_of_rtklib(tmp_path):
     text = "% program : RTKPOST\n%  GPST   {}(m) {}(m) {}(m)  Q  ns\n2020/09/13 12:26:40.0 1 2 3 1 9\n"
     path = tmp_path / "gnss.pos"
