@@ -17,7 +17,17 @@ from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamps_of
 from rille.datasets.imu import at_frames, read_imu
-from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
+from rille.datasets.manifest.model import (
+    Attitude,
+    Imu,
+    Manifest,
+    Odometry,
+    PoseFile,
+    PositionFile,
+    Recorded,
+    Times,
+    Truth,
+)
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import (
     TimedPoses,
@@ -25,6 +35,7 @@ from rille.datasets.poses import (
     columns_of_places,
     coverage,
     interpolate,
+    meanings,
     poses_of,
     positions_of,
     read_motion,
@@ -34,7 +45,7 @@ from rille.datasets.poses import (
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
-from rille.datasets.text.units import unit_of
+from rille.datasets.text.units import unit_of, unitless
 from rille.stages.core.errors import IncompleteError, InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 
@@ -46,6 +57,9 @@ TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
 
 TIME = re.compile("time|stamp", re.IGNORECASE)
 """Part of the title of a column of times."""
+
+GPS_TIME = re.compile(r"gps[_ ]?t(ime)?")
+"""Names of columns of times that know no leap seconds; there were none since 2017."""
 
 FEWEST_POSITIONS = 3
 """Positions that place a trajectory."""
@@ -271,6 +285,7 @@ class MotionReader:
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
+            self.doubt_clock(section, rows)
             self.state(truth_positions=self.true_positions(section, alone))
             self.warn(() if section.columns else unread_rotations(rows))
             return
@@ -342,6 +357,14 @@ class MotionReader:
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
 
+    def doubt_clock(self, section: Recorded, table: TextTable) -> None:
+        """Warn of times since 1970 that are called GPS time, unless an offset is stated."""
+        column = meanings(table).get("time", -1)
+        named = column >= 0 and table.header and GPS_TIME.fullmatch(unitless(table.header[column]))
+        if named and section.time_offset == 0.0 and (table.values([column]) > 1e9).all():
+            text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
+            self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
+
     def measured(self, section: PositionFile) -> None:
         """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.
 
@@ -356,6 +379,7 @@ class MotionReader:
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
+        self.doubt_clock(section, table)
         places, times = self.positions(section, found, "positions")
         at = self.sequence.times or ()
         there = sum(at[0] <= t <= at[-1] for t in times) if times and at else FEWEST_POSITIONS

@@ -39,6 +39,10 @@ def tum(t: float, x: float) -> str:
 # -- what it opens to --------------------------------------------------------------------------------------------------
 
 
+BASE = 1_600_000_000
+"""s; an afternoon of 2020."""
+
+
 def test_smallest_manifest(tmp_path, materialise):
     s = opened(write_sequence(tmp_path))
     assert (s.name, s.frames, s.frame_names) == ("rover", 3, ("00", "01", "02"))
@@ -968,6 +972,22 @@ def test_positions_of_another_unit_of_time_are_doubted(tmp_path, step, told):
     s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
     assert [line for line in s.warnings if "RIL-797" in line and "1 of its 3" in line] == list(s.warnings)
     assert bool(s.warnings) == told
+
+
+@pytest.mark.parametrize(("more", "told"), [("", 1), ("time_offset = -18", 0)])
+@pytest.mark.parametrize("table", ["positions", "truth"])
+def test_gps_time_is_not_that_of_the_images(tmp_path, table, more, told):
+    """As RTKLIB writes it."""
+    write_lines(
+        tmp_path / "p.pos",
+        ["%  GPST  e-baseline(m) n-baseline(m)", *(f"{BASE + 18 * (not told) + k} {k} 0" for k in range(3))],
+    )
+    write_lines(tmp_path / "t.txt", [f"{BASE + k}" for k in range(3)])
+    text = f'[times]\nfile = "t.txt"\n[{table}]\nfile = "p.pos"\n{more}\n' + (
+        "sigma = 0.5\n" if table == "positions" else "max_gap = 2\n"
+    )
+    lines = opened(write_sequence(tmp_path, text)).warnings
+    assert [("RIL-785" in line, "time_offset = -18" in line) for line in lines] == [(True, True)] * told
 
 
 def test_positions_may_be_those_of_poses_with_names(tmp_path):
