@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 
 from rille.stages.core.arrays import Floats
 
+EARTH_RADIUS = 6_371_008.8
+"""m; its mean: the ellipsoid departs from it by .5 %."""
+
 FORMS = re.compile(
     r"(?i)(EPSG|ESRI|IAU_\d+|IGNF|OGC|urn:ogc:def:crs:EPSG:):|[+{]"
     r"|(PROJ|PROJECTED|GEOG|GEOD|GEODETIC|GEOGRAPHIC|GEOC|LOCAL_|ENG|BOUND|COMPOUND|COMPD_)(CS|CRS)\["
@@ -74,6 +77,24 @@ def are_degrees(crs: str, origin: Sequence[float]) -> bool:
 
     x, y = map(abs, origin[:2])
     return 0 < min(x, y) <= 90 and max(x, y) <= 180 and CRS.from_user_input(crs).to_epsg() is not None
+
+
+def scale_at(crs: str, origin: Sequence[float]) -> float | None:
+    """Metres of the Earth, about, that a metre of a CRS is at an origin; 0: the origin is outside it, None: unknown.
+
+    Of a metre to the east and one to the north that which is farther from 1. Another body's is unknown.
+    """
+    from rasterio.crs import CRS
+    from rasterio.warp import transform
+
+    east, north = origin[:2]
+    try:
+        places: Any = transform(crs, "OGC:CRS84", [east, east + 1000.0, east], [north, north, north + 1000.0])
+    except Exception:  # GDAL's have no public class
+        return None if CRS.from_user_input(crs).to_epsg() is None else 0.0
+    longitude, latitude = np.radians(places)
+    ways = np.hypot((longitude[1:] - longitude[0]) * np.cos(latitude[0]), latitude[1:] - latitude[0]) * EARTH_RADIUS
+    return float(max(ways / 1000.0, key=lambda scale: abs(scale - 1.0)))
 
 
 def metric_crs(text: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from rille.datasets.poses import coverage, meanings, refuse_apart, times_of
 from rille.datasets.protocol import Rows, Vector, rows_of, vector_of
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.units import FORCES, RATES
+from rille.datasets.text.units import FORCES, RATES, unitless
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
@@ -39,7 +39,7 @@ flight one frame in twenty passes, with errors of 0.6 degrees in the median and 
 """
 
 GYROSCOPE = re.compile(r"(.*[./])?(gyr|g_?[xyz]\b|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
-ACCELEROMETER = re.compile(r"(.*[./])?(acc|a_|a[xyz]|lin(?!.*cov)|force)")
+ACCELEROMETER = re.compile(r"(.*[./])?(acc|alpha_|a_|a[xyz]|lin(?!.*cov)|force)")
 """Beginnings of column names, after the path of a field of a ROS message."""
 
 ORDER = ([1, 2, 3], [4, 5, 6])
@@ -101,6 +101,11 @@ def read_imu(path: Path) -> ImuRecord:
     time = meanings(table).get("time", 0)
     table, warnings = table.measured([time, *gyro, *accelerometer])
     times = times_of(table, time)
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    # 2 s: no IMU is as slow; stamps in milliseconds are taken for seconds where nothing names their unit.
+    if spacing > 2.0:
+        text = f"{path}: its samples are {spacing:.4g} s apart, if its times are seconds"
+        raise InputError("RIL-798", text, remedy="name the column by its unit, as time_ms or time_us")
     rates, forces = table.measures(gyro, RATES), table.measures(accelerometer, FORCES)
     # 200 rad/s: the fastest gyroscopes reach 70 (4000 degrees a second); larger numbers are damage.
     _possible(rates, 200.0, "rad/s", table)
@@ -129,9 +134,10 @@ def names_sensors(table: TextTable) -> bool:
 
 
 def _named(table: TextTable, starts: re.Pattern[str]) -> list[int]:
-    """The three columns x y z whose names begin so; empty unless there are exactly three."""
-    found = [k for k, name in enumerate(table.header) if starts.match(name)]
-    return found if len(found) == 3 else []
+    """The three columns whose names begin so, in the order of axes that their ends tell; empty if there are not 3."""
+    found = {k: unitless(name)[-1:] for k, name in enumerate(table.header) if starts.match(name)}
+    columns = sorted(found, key=found.__getitem__) if sorted(found.values()) == list("xyz") else list(found)
+    return columns if len(columns) == 3 else []
 
 
 def _possible(values: Floats, greatest: float, unit: str, table: TextTable) -> None:

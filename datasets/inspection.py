@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import glob
 import re
+import shlex
 from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
-from rille.datasets.images.headers import sizes_of
+from rille.datasets.images.headers import located, sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
@@ -29,6 +31,7 @@ from rille.datasets.poses import (
     matrix_at,
     meanings,
     of_images,
+    of_photographs,
     of_poses,
     positions_of,
     untimed,
@@ -150,7 +153,7 @@ def inspect(folder: Path) -> Findings:
             raise InputError(error.code, text, remedy="; ".join(lines)) from error
         raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
-    found.unread += found.views.others
+    found.unread += [*found.views.others, *_places_in_images(found.views.left, folder, search)]
     texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
@@ -177,6 +180,15 @@ def inspect(folder: Path) -> Findings:
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
     return found
+
+
+def _places_in_images(left: str, folder: Path, search: Search) -> list[str]:
+    """A line on places in EXIF of left images, and how they become a table; empty if there are none."""
+    sample = search.matching(folder, left)[:MOST_TEXTS]
+    places = sum(map(located, sample))
+    export = f"exiftool -csv -n -GPSLatitude -GPSLongitude -GPSAltitude {shlex.quote(str(Path(left).parent))} > gps.csv"
+    text = f"places in EXIF of {places} of {count(len(sample), 'left image')}: `{export}`, and [positions] of that file"
+    return [text] if places else []
 
 
 def _of_cameras(path: Path) -> bool:
@@ -211,19 +223,22 @@ def _relative(path: Path, folder: Path) -> str:
 # -- images ------------------------------------------------------------------------------------------------------------
 
 
+Named = dict[tuple[int, str], list[tuple[str, int, Path]]]
+"""Names without the side's token, side and path of images by the number of the token and their folder without it."""
+
 Sets = dict[tuple[int, str], tuple[list[Path], list[Path]]]
 """Left and right images by the number of the tokens in their names (``SIDES``), and their place."""
 
 
 def _by_token(images: list[Path], names: list[str]) -> Sets:
     """Images whose names have a side's token, in sets of one place; a set may have one side alone."""
-    named: dict[tuple[int, str], list[tuple[str, int, Path]]] = defaultdict(list)
+    named: Named = defaultdict(list)
     groups: Sets = defaultdict(lambda: ([], []))
     for path, name in zip(images, names, strict=True):
         if (at := side_of(name)) is not None:
             row, side, neutral = at
-            named[row, _place(path, neutral)].append((neutral, side, path))
-    for (row, place), found in named.items():
+            named[row, neutral.rpartition("/")[0]].append((neutral, side, path))
+    for (row, place), found in _of_one_kind(named):
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
@@ -316,9 +331,19 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 
-def _place(path: Path, without: str) -> str:
-    """Place of a set's file: its folder without the side's token, and its kind."""
-    return f"{without.rpartition('/')[0]} {path.suffix.lower()}"
+def _of_one_kind(named: Named) -> Iterator[tuple[tuple[int, str], list[tuple[str, int, Path]]]]:
+    """Images of one place and kind, or of several kinds in turns (1.png, 2.jpg, 3.png), with the place's name."""
+    for (row, place), found in named.items():
+        kinds = defaultdict(list)
+        for neutral, side, path in found:
+            kinds[path.suffix.lower()].append((neutral, side, path))
+        row_of_kinds = [path.suffix.lower() for _, _, path in sorted(found, key=lambda of: (of[1], natural(of[0])))]
+        changes = sum(a != b for a, b in pairwise(row_of_kinds))
+        shapes = {re.sub(r"\d+", "", neutral) for neutral, _, _ in found}
+        # Of two kinds with the same names one is made of the other; of a few of another kind nothing is known.
+        in_turns = len({of[:2] for of in found}) == len(found) and len(shapes) == 1 and changes > 2 * len(kinds)
+        for kind, of_kind in [("", found)] if in_turns else kinds.items():
+            yield (row, f"{place} {kind}"), of_kind
 
 
 def pattern(paths: list[Path], folder: Path) -> str:
@@ -333,6 +358,8 @@ def pattern(paths: list[Path], folder: Path) -> str:
         return place + glob.escape(names[0])
     head = _common_start(names).rstrip("0123456789")
     tail = _common_start([name[len(head) :][::-1] for name in names])[::-1].lstrip("0123456789")
+    if len({path.suffix.lower() for path in paths}) > 1:  # *g of .png and .jpg
+        tail = ""
     return f"{place}{glob.escape(head)}*{glob.escape(tail)}"
 
 
@@ -368,7 +395,10 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             names = (chosen[0].name, chosen[1].name)
             candidates.append(replace(_calibration((name,), chosen), names=names))
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
-    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairing.two_sides(single)]
+    # Cameras of other names differ by the same words as their images.
+    renamed = {name: _of_other_side(name, found.views.sides) for name in single}
+    pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
+    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairs]
     candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
     if candidates:
         place = Path(found.views.left).parent
@@ -385,6 +415,11 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
         unlike = [name for name in each if len(each) == found.views.pairs and str(read[name]) != str(read[taken[0]])]
         remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
         found.unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
+
+
+def _of_other_side(name: str, sides: tuple[str, str]) -> str:
+    """The name of a file of the left camera with the right one's word in the place of its own; else as it is."""
+    return "".join(sides[1] if word == sides[0] else word for word in re.split(r"([^\W_]+)", name))
 
 
 def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
@@ -436,7 +471,7 @@ def table_kind(path: Path, pairs: int) -> str:
     words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
     if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
         return "imu"
-    if "yaw" in header and "roll" in header and not table.crs:
+    if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
     if untimed(table) and len(table.rows) == pairs:
         return "truth"
@@ -446,6 +481,9 @@ def table_kind(path: Path, pairs: int) -> str:
     # Without times or names of images there must be one for each pair.
     if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
+    images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
+    if images and "time" in meanings(table) and len(table.rows) == pairs:
+        return "times"
     # Names of images, dates and the like are no numbers.
     return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
 

@@ -74,12 +74,21 @@ WORDS = (
     # RTKLIB has baselines from the reference station, Metashape X/Easting, PlotJuggler /fix/altitude.
     (re.compile(r"(?:utm[_. ]?|.*/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
     (re.compile(r"(?:utm[_. ]?|.*/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
-    (re.compile(r"(?:.*/)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"), lambda m: "z"),
-    (re.compile(r"(?:.*[./_ ])?lat(?:itude)?"), lambda m: "lat"),
-    (re.compile(r"(?:.*[./_ ])?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
+    # Gauss-Krueger's names, and EXIF's.
+    (re.compile(r"rechtswert"), lambda m: "x"),
+    (re.compile(r"hochwert"), lambda m: "y"),
+    (re.compile(r"h|hoehe|h\N{LATIN SMALL LETTER O WITH DIAERESIS}he|elev"), lambda m: "z"),
+    (
+        re.compile(
+            r"(?:.*[./]|(?:gps|gnss|wgs84|utm)[_ ]?)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"
+        ),
+        lambda m: "z",
+    ),
+    (re.compile(r"(?:.*[./_ ]|gps)?lat(?:itude)?"), lambda m: "lat"),
+    (re.compile(r"(?:.*[./_ ]|gps)?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
 )
 
-DOWNWARDS = re.compile(r"(.*/)?(down|depth)")
+DOWNWARDS = re.compile(r"(.*[./])?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
 
@@ -88,6 +97,12 @@ FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
 
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
+
+ECEF = re.compile(r"(?:.*[./_ ])?(?:ecef[-_. ]?([xyz])|([xyz])[-_. ]?ecef)")
+"""Names of columns of coordinates from the Earth's centre."""
+
+EARTH = (6.33e6, 6.40e6)
+"""m; distances of the ground from the Earth's centre."""
 
 ROTATION = re.compile(
     r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|heading|theta|omega|phi|kappa|euler|rodrig|axis_?angle).*"
@@ -141,10 +156,11 @@ def of_poses(table: TextTable, crs: str = "") -> TextTable:
 
 
 def projected(table: TextTable, crs: str) -> TextTable:
-    """The table with easting and northing, m, in the columns of longitude and latitude.
+    """The table with easting and northing, m, in the columns of longitude and latitude, or of coordinates from the
+    Earth's centre, whose third has the height above the ellipsoid.
 
     In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
-    have NaN there. Unchanged if no row has degrees, or columns of metres stand beside them.
+    have NaN there. Unchanged if no row has such coordinates, or columns of metres stand beside degrees.
 
     Raises
     ------
@@ -152,27 +168,46 @@ def projected(table: TextTable, crs: str) -> TextTable:
         A place lies where ``crs`` has none.
     """
     meant = meanings(table)
-    if not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}:
+    at = _from_centre(table, meant)
+    if not at and (not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}):
         return table
     from rasterio import warp
 
     transform: Any = warp.transform
-    at = [meant["lon"], meant["lat"]]
-    degrees = table.values(at)
-    there = (np.abs(degrees) <= (180, 90)).all(axis=1) & degrees.any(axis=1)
+    of_earth = table.values(at or [meant["lon"], meant["lat"]])
+    there = np.asarray(np.isfinite(of_earth).all(axis=1) & of_earth.any(axis=1))
+    if at:
+        of_earth[there] = np.transpose(transform("EPSG:4978", "EPSG:4979", *of_earth[there].T))
+    at = at or [meant["lon"], meant["lat"]]
+    there &= (np.abs(of_earth[:, :2]) <= (180, 90)).all(axis=1)
     if not there.any():
         return table
-    longitude, latitude = degrees[there][0]
+    longitude, latitude = of_earth[there][0, :2]
     crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
-    places = np.full(degrees.shape, np.nan)
+    places = np.where(there[:, None], of_earth, np.nan)
     try:
-        places[there] = np.transpose(transform("OGC:CRS84", crs, *degrees[there].T))
+        places[there, :2] = np.transpose(transform("OGC:CRS84", crs, *of_earth[there, :2].T))
     except Exception as error:  # GDAL's have no public class
         raise InputError("RIL-776", f"{table.name} has places beyond {crs}", remedy="correct or remove them") from error
     cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
     rows = tuple(tuple((dict(enumerate(row)) | of).values()) for row, of in zip(table.rows, cells, strict=True))
     header = tuple(unitless(name) if k in at else name for k, name in enumerate(table.header))
     return replace(table, rows=rows, header=header, crs=crs)
+
+
+def _from_centre(table: TextTable, meant: Mapping[str, int]) -> list[int]:
+    """Columns x, y and z of positions from the Earth's centre, by their names, or their distance alone; empty: none."""
+    named = _geocentric(table)
+    columns = named if named.keys() >= set(POSITION) else meant
+    if "lat" in meant or not columns.keys() >= set(POSITION) or _whole(meant):
+        return []
+    at = [columns[axis] for axis in POSITION]
+    places = table.values(at)
+    places = places[np.isfinite(places).all(axis=1) & places.any(axis=1)]
+    radius = np.linalg.norm(places, axis=1)
+    # A northing may be as large, but no height is 100 km.
+    geocentric = (radius > EARTH[0]) & (radius < EARTH[1]) & (bool(named) | (np.abs(places[:, 2]) > 1e5))
+    return at if len(places) and geocentric.all() else []
 
 
 def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) -> TimedPoses:
@@ -241,7 +276,9 @@ def _posed(table: TextTable, columns: Mapping[str, int], unit: float | None) -> 
 
 def _lengths(table: TextTable, columns: Sequence[int], unit: float | None) -> Floats:
     """Coordinates (n, columns), m; the sign of those that count downwards is changed."""
-    signs = [-1.0 if table.header and DOWNWARDS.fullmatch(unitless(table.header[k])) else 1.0 for k in columns]
+    bare = [unitless(name) for name in table.header]
+    down = {k for k, name in enumerate(bare) if DOWNWARDS.fullmatch(name) or (name == "d" and {"e", "n"} <= set(bare))}
+    signs = [-1.0 if k in down else 1.0 for k in columns]
     return table.measures(columns, units.LENGTHS, unit) * signs
 
 
@@ -289,8 +326,8 @@ def positions_of(
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
     posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
-    # Beside degrees nothing says in which frame angles are.
-    if not columns and posed and not table.crs:
+    # Beside degrees, and names of images, nothing says in which frame angles are.
+    if not columns and posed and not (table.crs or of_photographs(table)):
         return None
     degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
     if len(known) < 2 or (degrees and not table.crs):
@@ -298,8 +335,10 @@ def positions_of(
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
         if any(map(NOT_IN_PLANE.search, table.header)):
-            remedy = "give degrees in columns latitude and longitude, or metres in a plane, as UTM has them (easting, "
-            remedy += "northing), in columns x and y"
+            remedy = (
+                "give decimal degrees (neither minutes nor degrees times 10^7) in columns latitude and longitude, or "
+            )
+            remedy += "metres in a plane, as UTM has them (easting, northing), in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     placed = [meant["x"], meant["y"]]
     placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
@@ -329,7 +368,9 @@ def unread_rotations(table: TextTable) -> tuple[str, ...]:
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
     """Warning about coordinates (n, 2 or 3), m, in single precision, rounded to centimetres or more."""
     single = places.astype(np.float32)
-    rounded = (places == single).all(axis=0) & (np.ptp(places, axis=0) > 0)
+    # Decimals may be such numbers too, but not in each of their steps: whole metres, or halves.
+    stepwise = (places % (2.0 * np.spacing(np.abs(single).max(axis=0)))).any(axis=0)
+    rounded = (places == single).all(axis=0) & stepwise & (np.ptp(places, axis=0) > 0)
     step = float(np.spacing(np.abs(single).max(axis=0))[rounded].max(initial=0.0))
     # Few rows may be such numbers by chance.
     if step < 0.01 or len(places) < MIN_ROUNDED:
@@ -340,7 +381,7 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
 
 def _of_degrees(table: TextTable) -> tuple[str, ...]:
     """Warning about coordinates that are :func:`projected`."""
-    text = f"{table.name}: latitude and longitude are projected to {table.crs}"
+    text = f"{table.name}: places on Earth are projected to {table.crs}"
     return (warning("RIL-774", text),) if table.crs else ()
 
 
@@ -379,12 +420,38 @@ def meanings(table: TextTable) -> dict[str, int]:
     for k, name in enumerate(table.header):
         if table.header.count(name) > 1:
             continue
-        bare = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
-        matches = ((pattern.fullmatch(bare), meaning) for pattern, meaning in WORDS)
+        word = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
+        matches = ((pattern.fullmatch(word), meaning) for pattern, meaning in WORDS)
         meant = next((meaning(match) for match, meaning in matches if match), None)
         if meant is not None:
             columns.setdefault({"lat": "y", "lon": "x"}.get(meant, meant) if table.crs else meant, k)
+    bare = [unitless(name) for name in table.header]
+    heights = [k for k, name in enumerate(bare) if name in ("u", "d")]
+    if {"e", "n"} <= set(bare) and heights:  # beside others they may mean anything
+        columns.setdefault("z", heights[0])
+    if table.crs and "x" not in columns:
+        columns |= _geocentric(table)
     return columns
+
+
+def of_photographs(table: TextTable) -> bool:
+    """Whether rows are places of images by name, with angles, as Metashape and Pix4D write them."""
+    meant = meanings(table)
+    by_name = {"x", "y", *ANGLES} <= meant.keys() and not {"time", *QUATERNION} & meant.keys()
+    return by_name and bool(np.isinf(table.values([0])).all())
+
+
+def columns_of_places(table: TextTable) -> dict[Any, str | int]:
+    """Numbers (from 1) of the columns that their names make those of positions, of poses too; none without x and y."""
+    meant = meanings(table)
+    named = {name: k + 1 for name, k in meant.items() if name in ("time", *POSITION)}
+    return dict(named) if {"x", "y"} <= meant.keys() else {}
+
+
+def _geocentric(table: TextTable) -> dict[str, int]:
+    """Columns that are named as coordinates from the Earth's centre, by axis."""
+    found = ((ECEF.fullmatch(unitless(name)), k) for k, name in enumerate(table.header))
+    return {match[1] or match[2]: k for match, k in found if match}
 
 
 def _whole(columns: Mapping[str, int]) -> bool:

@@ -22,6 +22,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
 from dataclasses import dataclass, field, replace
@@ -43,7 +44,7 @@ from rille.pipeline.engine.spec import map_ports
 from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 from rille.pipeline.flow import config
 from rille.stages.core.declare import AnyArray, Bundle, Stage
-from rille.stages.core.errors import ConfigError, InputError
+from rille.stages.core.errors import ConfigError, InputError, warning
 from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:
@@ -53,6 +54,13 @@ if TYPE_CHECKING:
 
 Settings = Mapping[str, Any]
 Known = dict[Handle, Bundle]
+
+
+ELSEWHERE: Mapping[str, str] = {
+    "column_disparity": "; disparities of another program are read by [disparity] of a manifest",
+    "elevation": "; rille.reconstruct(..., vehicle={...}) judges the terrain of a run anew",
+}
+"""Where data of another origin than the step before are taken, by the variable of that step."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +162,16 @@ class StereoPair:
             dims=("row", "col"),
             coords={} if valid is None else {"valid": (("row", "col"), np.asarray(valid))},
             name=f"{camera}_image",
-            attrs={"units": "1", "long_name": f"{camera} image of pair {self.frame}", **_carried({}, self.settings)},
+            attrs={
+                "units": "1",
+                "long_name": f"{camera} image of pair {self.frame}",
+                **_carried({}, self.settings, [self._mark(camera)]),
+            },
         )
+
+    def _mark(self, camera: str) -> int:
+        """Checksum of an image, by which a disparity of others is known."""
+        return zlib.crc32(np.asarray(self._bundle(camera)["image"]).tobytes())
 
 
 def open(path: str | Path, **settings: Settings) -> StereoSequence:
@@ -282,7 +298,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
 
-    carried = _settings(left)
+    carried, marks = _settings(left), [mark for image in (left, right) for mark in _noted(image).get("images", [None])]
     built: Any = config.build(carried, {"hfvm": hfvm})
     left, right = map(_rows_first, (left, right))
     images = [_pixels(image) for image in (left, right)]
@@ -305,7 +321,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     meta = facts(disparity.arrays, built.hfvm, disparity.unlike, int(np.count_nonzero(first.valid[0])))
     for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)
-    return _dataset(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}))
+    return _dataset(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}), marks)
 
 
 def _pixels(image: Any) -> AnyArray:
@@ -355,6 +371,11 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     ConfigError
         ``every`` is no whole number from 1.
 
+    Warns
+    -----
+    UserWarning
+        The disparity was found in other images.
+
     Examples
     --------
     >>> import rille
@@ -395,6 +416,11 @@ def _disparity(disparity: xarray.Dataset, pair: object) -> Bundle:
     if disparity.column_disparity.shape != size:
         text = f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}"
         raise InputError("RIL-865", text, remedy="give the disparity that rille.match finds for this pair")
+    for camera, mark in zip(CAMERAS, _noted(disparity).get("images", ()), strict=False):
+        if mark is not None and mark != pair._mark(camera):  # None: of an array of the user's own
+            text = f"the disparity was not found in the {camera} image of pair {pair.frame} of {pair.sequence.name}"
+            line = f"{text}: unless that shows the same, give the pair whose images rille.match was given"
+            warnings.warn(warning("RIL-796", line), stacklevel=3)
     return given
 
 
@@ -429,6 +455,11 @@ def terrain(
         The disparity is not that of an image of this size.
     ConfigError
         A parameter is unknown, or not permitted.
+
+    Warns
+    -----
+    UserWarning
+        The disparity was found in other images.
 
     Examples
     --------
@@ -599,13 +630,18 @@ def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
 # -- datasets -----------------------------------------------------------------------------------------------------
 
 
-def _carried(meta: Settings, settings: Settings) -> dict[str, str]:
-    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings)})}
+def _carried(meta: Settings, settings: Settings, images: Series[int | None] = ()) -> dict[str, str]:
+    """Attribute for the next step; ``images``: checksums of one image, or of the left and the right one."""
+    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings), "images": images})}
+
+
+def _noted(data: Any) -> dict[str, Any]:
+    """What the step before has :func:`_carried`."""
+    return dict(json.loads(getattr(data, "attrs", {}).get("rille", "{}")))
 
 
 def _settings(data: Any) -> dict[str, Any]:
-    text = getattr(data, "attrs", {}).get("rille")
-    return {} if text is None else dict(json.loads(text)["settings"])
+    return dict(_noted(data).get("settings", {}))
 
 
 def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
@@ -630,7 +666,8 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
         same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
         lacking += [] if all(same) else ["x and y of all its cells, as they were"]
     if lacking:
-        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"give what {maker} returns, whole")
+        remedy = f"give what {maker} returns, whole{ELSEWHERE.get(variable, '')}"
+        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=remedy)
     arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
     # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
     for array in stage.outputs:
@@ -642,7 +679,7 @@ def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bu
     return Bundle(arrays, meta)
 
 
-def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset:
+def _dataset(stage: Stage, result: Bundle, settings: Settings, images: Series[int | None] = ()) -> xarray.Dataset:
     """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
     import xarray
 
@@ -655,4 +692,4 @@ def _dataset(stage: Stage, result: Bundle, settings: Settings) -> xarray.Dataset
     places = coordinates(lattice, str(result.meta.get("frame", "local"))) if lattice is not None and on_it else {}
     coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
     plain = {k: v for k, v in result.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
-    return xarray.Dataset(variables, coords, {**plain, **_carried(result.meta, settings)})
+    return xarray.Dataset(variables, coords, {**plain, **_carried(result.meta, settings, images)})

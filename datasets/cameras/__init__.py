@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
+
+from yaml import YAMLError
 
 from rille.datasets.cameras import boofcv, colmap, kitti, makers, opencv, pds, slam, tsai
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
 from rille.datasets.cameras.text import parse_nested
+from rille.datasets.images.pairing import side_of
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import read_text, refuse_decimal_commas
 from rille.stages.core.errors import InputError
+from rille.stages.geometry.geometry import RigidTransform
 
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
@@ -22,7 +28,7 @@ KNOWN = (
     "camodocal, VINS, Basalt, mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, "
     "Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) are read; "
     "of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
-    "transposed), as OpenCV's YAML"
+    "transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -95,12 +101,30 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
     for recognises, read in PLAIN:
         if recognises(plain):
             return read(plain, path)
-    fields = Fields(parse_nested(text, str(path)), str(path))
+    try:
+        fields = Fields(parse_nested(text, str(path)), str(path))
+    except InputError as error:
+        # Only of a file that should be YAML a parser's words help.
+        if not isinstance(error.__cause__, YAMLError) or path.suffix.lower() in (".yaml", ".yml", ".json"):
+            raise
+        fields = Fields({}, str(path))
     for knows, read_fields in NESTED:
         if knows(fields):
             found = read_fields(fields, path)
             fields.check_lens()
             if any(camera.T_camera_reference is None for camera in found):
                 fields.check_turn()
+                found = _parallel(found, fields, path)
             return found
     raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)
+
+
+def _parallel(found: list[CalibratedCamera], fields: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras without a pose that a ``baseline`` in their file makes a rig; as they are if there is none."""
+    T_right_left = makers.beside(fields)
+    # A file of one side may state it, too.
+    if T_right_left is None or len(found) > 2 or side_of(f"{path.parent.name}/{path.stem}") is not None:
+        return found
+    poses = RigidTransform.identity(), T_right_left
+    sides = zip(CAMERAS, (found[0], found[-1]), poses, strict=True)
+    return [replace(camera, name=name, T_camera_reference=T) for name, camera, T in sides]

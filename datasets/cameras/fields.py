@@ -57,6 +57,9 @@ TURN = re.compile(
 )
 """Keys that say how a camera is turned."""
 
+SENSOR = re.compile(r"imu|body|base|lidar|velo|gps|t_?b_?c", re.I)
+"""Part of keys that place a camera among other sensors, which tells nothing of two cameras."""
+
 OTHER = re.compile(r"std|deviat|sigma|err|covar|uncert|mask|file|path|name|topic|frame|unit|comment", re.I)
 """Part of keys that only look like those of a lens: of its errors, or of names."""
 
@@ -256,7 +259,8 @@ class Fields:
             numbers = flattened(value) or [value]
             # 16: of a 4 x 4 matrix; more are of the views of a chessboard.
             turns = isinstance(value, Mapping) or (len(numbers) <= 16 and _any_but_zero(numbers))
-            if turns and TURN.fullmatch(key) and self.at + key not in self.used:
+            of_camera = (turns and TURN.fullmatch(key)) or (_is_rotation(numbers) and not SENSOR.search(key))
+            if of_camera and self.at + key not in self.used:
                 remedy = "state it as R, a 3 x 3 matrix, with T (m), x_right = R x_left + T; or remove it"
                 raise self.error("RIL-766", key, "seems to turn a camera, and is not read there", remedy)
 
@@ -283,6 +287,15 @@ class Fields:
     def _within(self, key: str) -> AbstractContextManager[None]:
         """Put the file and the key in front of errors raised inside."""
         return within(f"{self.file}: {self.at}{key}")
+
+
+def _is_rotation(numbers: Sequence[Any]) -> bool:
+    """Whether numbers, perhaps as text, are R or [R | t], rows of 3 or 4, with another R than that of equal axes."""
+    try:
+        m = np.array(numbers, dtype=np.float64).reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)])[:3, :3]
+    except (KeyError, TypeError, ValueError):
+        return False
+    return bool(np.allclose(m @ m.T, np.eye(3), atol=1e-3) and not np.array_equal(m, np.eye(3)))
 
 
 def by_count(coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:

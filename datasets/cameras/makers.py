@@ -20,6 +20,7 @@ from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
 from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.units import METRIC, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -203,13 +204,18 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
         # librealsense's ``rs2_extrinsics`` lists its rotation column by column.
         rig.values["rotation"] = np.reshape(rig.values["rotation"], (3, 3)).T
     T_right_left = relative(rig)
-    if T_right_left is None and "baseline" in rig:
-        T_right_left = parallel(rig.number("baseline"))
     rig.check_turn()
+    T_right_left = T_right_left or beside(rig)
     if T_right_left is not None:
         return stereo_cameras(lenses[0], lenses[-1], T_right_left)
     names = CAMERAS if lenses[1:] else [path.stem]
     return [CalibratedCamera(name, lens) for name, lens in zip(names, lenses, strict=True)]
+
+
+def beside(f: Fields) -> RigidTransform | None:
+    """T_right_left of parallel cameras by a ``baseline``, metres or the unit in its key; None if there is none."""
+    keys = [key for key in f.values if unitless(key).lower() == "baseline" and key in f]
+    return parallel(f.number(keys[0]) * METRIC.get(unit_of(keys[0]), 1.0)) if len(keys) == 1 else None
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:

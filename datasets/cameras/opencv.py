@@ -16,8 +16,11 @@ from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
 
-KEY = re.compile(r"(?:(left|right|l|r)[._ ]?)?([a-z._ ]+?)[._ ]?(left|right|l|r|[12])?", re.I)
+KEY = re.compile(r"(?:(?:(left|right|l|r)|cam(?:era)?_?([01]))[._ ]?)?([a-z._ ]+?)[._ ]?(left|right|l|r|[012])?", re.I)
 """A key of one side, with the side before or after the name."""
+
+NUMBERS = {"l": "1", "r": "2"}
+"""Numbers of the sides, by their first letters."""
 
 MATRIX = re.compile(r"m|k|cm|mtx|matrix|cam(era)?(matrix|mtx)|intrinsics?(matrix)?")
 DISTORTION_OF_SIDE = re.compile(r"d|dist(ortion)?(coeff?s?|coefficients)?")
@@ -47,18 +50,19 @@ OST_KEYS = {
 
 def sides(f: Fields) -> list[tuple[str, str]]:
     """Keys of camera matrix and distortion of the left and of the right camera; empty if not both have a matrix."""
-    found: dict[tuple[bool, bool], str] = {}
+    found: dict[tuple[str, bool], str] = {}
     for key, value in f.values.items():
         parts = KEY.fullmatch(key)
-        side = (parts[1] or parts[3] or "").lower() if parts else ""
+        side = (parts[1] or parts[2] or parts[4] or "").lower() if parts else ""
         if parts is None or not side or flattened(value) is None:  # k1 may be a coefficient
             continue
-        what = re.sub("[._ ]", "", parts[2]).lower()
+        what = re.sub("[._ ]", "", parts[3]).lower()
         matrix = MATRIX.fullmatch(what) is not None
         if matrix or DISTORTION_OF_SIDE.fullmatch(what):
-            found.setdefault((side in ("right", "r", "2"), matrix), key)
-    whole = {(False, True), (True, True)} <= found.keys()
-    return [(found[right, True], found.get((right, False), "distortion")) for right in (False, True)] if whole else []
+            found.setdefault((NUMBERS.get(side[0], side), matrix), key)
+    both = ("0", "1") if ("0", True) in found else ("1", "2")
+    whole = all((side, True) in found for side in both)
+    return [(found[side, True], found.get((side, False), "distortion")) for side in both] if whole else []
 
 
 def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -75,6 +79,8 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
     elif placed.has(*POSE):
         poses = RigidTransform.identity(), relative(placed)
+    elif all(key in placed for key in ("R1", "P1", "R2", "P2")):  # of stereoRectify
+        poses = _unrectified(placed, "R1", "P1"), _unrectified(placed, "R2", "P2")
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
     return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]

@@ -36,6 +36,9 @@ LAYOUTS: Mapping[str, tuple[int, int, int | None]] = {
     "8UC3": (3, 8, cv2.COLOR_BGR2GRAY),
     "rgba8": (4, 8, cv2.COLOR_RGBA2GRAY),
     "bgra8": (4, 8, cv2.COLOR_BGRA2GRAY),
+    # Of USB cameras; every other byte is the luminance.
+    **dict.fromkeys(("yuv422", "uyvy"), (2, 8, cv2.COLOR_YUV2GRAY_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, 8, cv2.COLOR_YUV2GRAY_YUY2)),
     **{
         f"bayer_{filters}{bits}": (1, bits, getattr(cv2, f"COLOR_Bayer{filters.upper()}2GRAY"))
         for filters in ("rggb", "bggr", "gbrg", "grbg")

@@ -67,6 +67,7 @@ def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
     file = BytesIO(data)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
+    shape = tuple(side for side in shape if side != 1)  # networks have one channel, and one image a batch
     _check(shape[::-1], size, dtype.kind == "f")
     return np.frombuffer(data, dtype, size[0] * size[1], file.tell()).reshape(shape, order="F" if by_columns else "C")
 

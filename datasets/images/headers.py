@@ -7,6 +7,7 @@ file.
 from __future__ import annotations
 
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 from warnings import catch_warnings
 
@@ -69,6 +70,14 @@ def orientation(image: Any) -> int:
         stated = int(image.getexif().get(0x0112, 1)) if image.format != "PNG" or "exif" in image.info else 1
         return stated if 1 <= stated <= 8 else 1
     return 1
+
+
+def located(path: Path) -> bool:
+    """Whether EXIF of an image file states a latitude and a longitude."""
+    with catch_warnings(action="ignore"), suppress(Exception), path.open("rb") as file:
+        image = opened(file)
+        return image.format in ("JPEG", "TIFF") and {2, 4} <= image.getexif().get_ifd(0x8825).keys()
+    return False
 
 
 def _bits(image: Any) -> int:

@@ -48,6 +48,10 @@ KINDS: dict[str, tuple[str, str]] = {
         ".img .vic .vicar .cub .fit .fits",
         "convert them, without a stretch of each: gdal_translate -of PNG -ot UInt16 FILE FILE.png",
     ),
+    "COLMAP file": (
+        "cameras.bin images.bin points3D.bin rigs.bin frames.bin",
+        "colmap model_converter --input_path FOLDER --output_path FOLDER --output_type TXT",
+    ),
     "headerless image": (
         ".raw .bin .yuv .bayer",
         "state its size and bits: magick -size WIDTHxHEIGHT -depth 8 gray:FILE FILE.png",
@@ -56,13 +60,13 @@ KINDS: dict[str, tuple[str, str]] = {
     "archive": (".zip .tar .gz .tgz .bz2 .xz .7z .rar .zst", "unpack it"),
     "file": ("", "neither images nor a calibration or table that is known"),
 }
-"""Endings and remedy by the name of a kind; the kind ``file`` is any other."""
+"""Endings, or names, and remedy by the name of a kind; the kind ``file`` is any other."""
 
 
 def kind_of(name: str) -> str:
-    """The kind of a file by its ending."""
-    ending = PurePath(name).suffix.lower()
-    return next((kind for kind, (endings, _) in KINDS.items() if ending in endings.split()), "file")
+    """The kind of a file by its name or its ending."""
+    of = {PurePath(name).name, PurePath(name).suffix.lower()}
+    return next((kind for kind, (names, _) in KINDS.items() if not of.isdisjoint(names.split())), "file")
 
 
 def hints(name: str) -> list[str]:

@@ -50,6 +50,8 @@ def masked(sequence: Sequence, digests: files.Digests) -> Sequence:
         text = f"a mask leaves out {100 * (1 - keep.mean()):.1f} % of the {side} images ({path.name})"
         if keep.mean() < 0.5:
             lines.append(warning("RIL-909", f"{text}: is it the wrong way round? Bright pixels are used"))
+        elif keep.all():
+            lines.append(warning("RIL-799", f"{text}: is it drawn in its transparency? Only dark pixels are left out"))
         else:
             notes.append(text)
 

@@ -438,7 +438,12 @@ def _with_gaps(by_key: tuple[dict[str, Path], dict[str, Path]], rule: str, root:
     """Pairs of all keys and of missing numbers of a running count; an absent file has its expected name."""
     whole = next(key for key in by_key[0] if key in by_key[1])
     keys = counted(in_order(list({**by_key[0], **by_key[1]})))
-    paths = [[ours.get(key) or _called(ours[whole], whole, key, rule, root) for ours in by_key] for key in keys]
+    together = by_key[0][whole].parent == by_key[1][whole].parent  # a folder of both for each frame, say
+    paths = []
+    for key in keys:
+        called = [ours.get(key) or _called(ours[whole], whole, key, rule, root) for ours in by_key]
+        place = next((ours[key].parent for ours in by_key if key in ours), None) if together else None
+        paths.append([path if place is None else place / path.name for path in called])
     pairs = []
     for key, pair in zip(keys, _named([(left, right) for left, right in paths]), strict=True):
         gone = [path for path, ours in zip((pair.left, pair.right), by_key, strict=True) if key not in ours]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, model_validator
 
-from rille.datasets.georeference import Georeference, are_degrees, metric_crs
+from rille.datasets.georeference import Georeference, are_degrees, metric_crs, scale_at
 from rille.datasets.protocol import Vector
 from rille.datasets.text.reading import read_toml
 from rille.datasets.text.validation import TAG, validated
@@ -410,6 +410,14 @@ class World(Table):
         if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
             text = f"origin = {list(self.origin)} looks like degrees"
             raise ValueError(f"{text}: give easting, northing and height in {self.crs}, metres")
+        scale = None if self.crs is None or self.origin is None else scale_at(self.crs, self.origin)
+        # Grids of countries and polar regions differ from the ground by 5 % at most.
+        if scale is not None and not 0.9 < scale < 1.1:
+            where = f"is {scale:.2g} m long" if scale else "does not exist"
+            text = f"a metre of {self.crs} {where} at origin = {list(self.origin or ())}"
+            raise ValueError(
+                f"{text}: are easting and northing exchanged? else give them in a CRS of the place, as UTM"
+            )
         return self
 
     @property

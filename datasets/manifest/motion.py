@@ -17,13 +17,25 @@ from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamps_of
 from rille.datasets.imu import at_frames, read_imu
-from rille.datasets.manifest.model import Attitude, Imu, Manifest, Odometry, PoseFile, PositionFile, Times, Truth
+from rille.datasets.manifest.model import (
+    Attitude,
+    Imu,
+    Manifest,
+    Odometry,
+    PoseFile,
+    PositionFile,
+    Recorded,
+    Times,
+    Truth,
+)
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import (
     TimedPoses,
     TimedPositions,
+    columns_of_places,
     coverage,
     interpolate,
+    meanings,
     poses_of,
     positions_of,
     read_motion,
@@ -33,8 +45,8 @@ from rille.datasets.poses import (
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
-from rille.datasets.text.units import unit_of
-from rille.stages.core.errors import IncompleteError, InputError
+from rille.datasets.text.units import unit_of, unitless
+from rille.stages.core.errors import IncompleteError, InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 
 Poses = tuple[RigidTransform | None, ...]
@@ -45,6 +57,12 @@ TWO_CELLS = re.compile(r"\d{10} \d{1,9}")
 
 TIME = re.compile("time|stamp", re.IGNORECASE)
 """Part of the title of a column of times."""
+
+GPS_TIME = re.compile(r"gps[_ ]?t(ime)?")
+"""Names of columns of times that know no leap seconds; there were none since 2017."""
+
+FEWEST_POSITIONS = 3
+"""Positions that place a trajectory."""
 
 NEEDS_TIMES = "give [times] with file, names = true or rate_hz"
 
@@ -143,7 +161,7 @@ class MotionReader:
         if self.growing and not path.read_bytes().endswith(b"\n"):  # the last line is still being written
             del lines[-1:]
         header, found = tuple[str, ...](), list[tuple[list[str], int]]()
-        images, by_name = False, dict[str, int]()
+        images, by_name, widest = False, dict[str, int](), tuple[str, ...]()
         for k, line in enumerate(lines, start=1):
             text = undated(line.strip())
             cells = split(text.removeprefix("#"), next((s for s in ",;\t" if s in text), None))
@@ -154,13 +172,15 @@ class MotionReader:
                 continue
             titles = dict(zip(header, cells, strict=True)) if len(header) == len(cells) else {}
             stated = [cell for title, cell in titles.items() if TIME.search(title)]
-            images = images or bool(names)
+            images, widest = images or bool(names), max(widest, cells, key=len)
             by_name |= {ntpath.splitext(ntpath.basename(cell))[0]: len(found) for cell in names or cells[1:2]}
             times = [cell for cell in stated if NUMBER.match(cell)][:1] or [*others[0].split(), *others[1:]]
             found.append((times, k))
         if all(TWO_CELLS.fullmatch(" ".join(cells)) for cells, _ in found):
             found = [([of_two(*cells)], k) for cells, k in found]
-        units = [unit_of(title) for title in header if TIME.search(title)]
+        # Over a single column blanks part no titles: time [ms].
+        titles_of = header if len(widest) > 1 else (" ".join(header),)
+        units = [unit_of(title) for title in titles_of if TIME.search(title)]
         unit = next((stated for stated in units if stated in UNITS), "auto")
         column = int(_counts([cells for cells, _ in found]))
         rows = [(cells[column], k) for cells, k in found]
@@ -265,6 +285,7 @@ class MotionReader:
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
+            self.doubt_clock(section, rows)
             self.state(truth_positions=self.true_positions(section, alone))
             self.warn(() if section.columns else unread_rotations(rows))
             return
@@ -305,7 +326,7 @@ class MotionReader:
     def positions(
         self, section: Truth | PositionFile, found: TimedPositions, table: str
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
-        """Positions in metres, and their times (s) by the images' clock; None: one for each pair.
+        """Positions in metres, and their times (s) by the images' clock, or numbers of pairs; None: one for each pair.
 
         Rows that begin with names of images are those of the left images of these names.
 
@@ -321,7 +342,9 @@ class MotionReader:
             return found.positions, times
         rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
-        clock = None if len(at) == len(self.pairs) else self.sequence.times
+        # Measurements may be of numbers of pairs.
+        numbers = tuple(map(float, range(len(self.pairs)))) if table == "positions" else None
+        clock = None if len(at) == len(self.pairs) else self.sequence.times or numbers
         if at and (clock or len(at) == len(self.pairs)):
             return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
         of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
@@ -334,6 +357,14 @@ class MotionReader:
             raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
         return rows, None
 
+    def doubt_clock(self, section: Recorded, table: TextTable) -> None:
+        """Warn of times since 1970 that are called GPS time, unless an offset is stated."""
+        column = meanings(table).get("time", -1)
+        named = column >= 0 and table.header and GPS_TIME.fullmatch(unitless(table.header[column]))
+        if named and section.time_offset == 0.0 and (table.values([column]) > 1e9).all():
+            text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
+            self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
+
     def measured(self, section: PositionFile) -> None:
         """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.
 
@@ -343,11 +374,18 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        found = positions_of(read_motion(self.root / section.file, crs=self.crs), "auto", section.columns, section.unit)
+        table = read_motion(self.root / section.file, crs=self.crs)
+        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
+        self.doubt_clock(section, table)
         places, times = self.positions(section, found, "positions")
+        at = self.sequence.times or ()
+        there = sum(at[0] <= t <= at[-1] for t in times) if times and at else FEWEST_POSITIONS
+        if there < FEWEST_POSITIONS <= min(len(places), len(at)):
+            text = f"{section.file}: {there} of its {len(places)} positions are of the time of the frames"
+            self.warn((warning("RIL-797", f"{text}: check its clock, and the unit of its times (time_ms)"),))
         sigma = [section.sigma] * 3 if isinstance(section.sigma, float) else list(section.sigma)
         measured = {
             "positions": [list(place) for place in places],
@@ -389,7 +427,8 @@ def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[in
     """
 
     def parts(name: str) -> tuple[str, ...]:
-        return tuple(re.split(r"[/\\]", name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name))
+        stem = name.rpartition(".")[0] if name.lower().endswith(SUFFIXES) else name
+        return tuple(re.split(r"[/\\]", stem.removeprefix("./")))
 
     known = {parts(name): row for row, name in enumerate(names)}
     paths = [parts(str(pair.left)) for pair in pairs]

@@ -46,6 +46,9 @@ BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
 COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
 """What stands between numbers, and numbers with a decimal comma and with a point."""
 
+TWO_NAMES = re.compile(r"[\s#%]*[^\W\d][^,;\t\n]*,\s*[^\W\d][^,;\t\n]*(\n|$)")
+"""A first line with the names of two columns, which a comma parts."""
+
 LISTED = re.compile(r"\d,\d+,\s")
 """A number with a decimal comma in a list of numbers, between which there are blanks."""
 
@@ -157,7 +160,8 @@ def read_lines(path: Path, what: str) -> list[str]:
     columns = [[int(row[k]) for row in rows] for k in (1, 2)]
     # A greater number is a stamp of milliseconds or less, which has no fraction.
     # A comma in each line may part two columns of integers: stamps that never go back, and what goes with them.
-    if not rows or not (all(a < b for c in columns for a, b in pairwise(c)) or columns[0][0] > 10**12):
+    ascending = all(a < b for c in columns for a, b in pairwise(c))
+    if not rows or not (ascending or columns[0][0] > 10**12 or TWO_NAMES.match("\n".join(lines[:SAMPLE]))):
         refuse_decimal_commas(lines, path)
     return lines
 

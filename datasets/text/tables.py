@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,10 @@ from rille.stages.core.errors import InputError, warning
 from rille.stages.core.quantities import count
 
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|[-+]?(nan|inf)$", re.IGNORECASE)
-STRUCTURED = re.compile(r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>\$G[A-Z]{4},))")
-"""Beginnings of files with records of another form: GPX and KML are XML."""
+STRUCTURED = re.compile(
+    r"\s*(?:(?P<JSON>\{|\[\s*[\[{])|(?P<XML><[?!a-zA-Z])|(?P<NMEA>(?:[\d.:TZ-]+[\s,;]+)?\$[A-Z]{5},))"
+)
+"""Beginnings of files with records of another form: GPX and KML are XML; a logger writes its time before NMEA's."""
 
 ROWS = (
     "write rows of numbers below a line of names, as time,x,y,z or time,x,y,z,qw,qx,qy,qz, in metres, or "
@@ -74,16 +77,18 @@ class TextTable:
         return np.array([[_number(row[column]) for column in columns] for row in self.rows])
 
     def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, tuple[str, ...]]:
-        """The table without rows that lack a value in a column, or are ``lost``, and a warning with their number.
+        """The table without rows that lack a value in a column, repeat the row before, or are ``lost``, and a warning.
 
         If no row would be left, all are kept, and their reader reports the error.
         """
-        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | lost)
+        repeated = np.array([False, *(row == before for before, row in pairwise(self.rows))])
+        missing = np.asarray(np.isnan(self.values(columns)).any(axis=1) | repeated | lost)
         if missing.all() or not missing.any():
             return self, ()
         kept = [(row, line) for row, line, gone in zip(self.rows, self.lines, missing, strict=True) if not gone]
         rows, lines = zip(*kept, strict=True)
-        text = f"{self.name}: {count(int(missing.sum()), 'row')} of {len(missing)} without a measurement left out"
+        rows_left_out = count(int(missing.sum()), "row")
+        text = f"{self.name}: {rows_left_out} of {len(missing)} without a measurement of their own left out"
         text += f", the first in line {self.lines[int(missing.argmax())]}"
         return replace(self, rows=rows, lines=lines), (warning("RIL-706", text),)
 
@@ -166,6 +171,8 @@ def read_table(path: Path, what: str) -> TextTable:
             names, units = (names, cells) if of_units else (text, ())
             continue
         if rows and len(row) != columns:
+            if k == len(lines) and len(row) < columns and not path.read_bytes().endswith(b"\n"):
+                break  # torn, as of a recorder that was switched off
             text = f"{path}, line {k}: {len(row)} columns where the first row has {columns}"
             raise InputError("RIL-285", text, remedy="correct or remove that line")
         columns = len(row)
@@ -176,6 +183,8 @@ def read_table(path: Path, what: str) -> TextTable:
         text = f"{what} {path} has no rows that begin with a number{last}"
         raise InputError("RIL-286", text, remedy="check that it is the right file; dates are as 2026-05-31 12:00:00")
     header = split(names, separator, columns)
+    if "".join(header[:1]).lower() in ("gpst", "utc") and len(header) == columns - 1:  # RTKLIB's week, and its seconds
+        header = ("week", *header)
     header = header if len(header) == columns else _of_places(names, columns)
     if len(units) == columns:
         header = tuple(f"{n} [{u.strip('[]()')}]" if u else n for n, u in zip(header, units, strict=False))
@@ -192,7 +201,11 @@ def _of_places(names: str, columns: int) -> tuple[str, ...]:
 
 def _named(row: tuple[str, ...], columns: int) -> bool:
     """Whether numbers follow a name, as that of a vehicle or of an image, in as many cells as there are names."""
-    return len(row) == columns and row[0][:1].isalnum() and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
+    return (
+        len(row) == columns
+        and re.match(r"[\w./]", row[0]) is not None
+        and 2 * sum(map(bool, map(NUMBER.match, row))) > columns
+    )
 
 
 def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]:
@@ -200,7 +213,7 @@ def split(text: str, separator: str | None, columns: int = 0) -> tuple[str, ...]
 
     Without a separator, cells are separated by blanks, or by tabs alone if that makes ``columns`` cells.
     """
-    if separator is None and len(text.split()) != columns == text.count("\t") + 1:
+    if separator is None and "\t" in text and len(text.split()) != columns == text.count("\t") + 1:
         separator = "\t"
     cells = [cell.strip().strip("\"'").strip() for cell in text.split(separator)]
     return tuple(cells[:-1] if separator and len(cells) not in (1, columns) and not cells[-1] else cells)

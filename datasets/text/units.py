@@ -32,14 +32,20 @@ SPELT = (
     ("ft", "feet|foot"),
     ("in", "inch(es)?"),
     ("yd", "yards?"),
+    *(
+        (symbol, f"{spelt}s(ec(ond)?s?)?")
+        for symbol, spelt in (("ms", "m(illi)?"), ("us", "(u|micro)"), ("ns", "n(ano)?"))
+    ),
+    ("s", "sec(ond)?s?"),
 )
 """Symbols of units, and their other spellings."""
 
 STATED = re.compile(
     r"[\[(](.*?)[\])]"
-    r"|[_ ]((?:[mun]?s|[muckd]?m|ft|in|inch|yd)(?:[_/]s2?)?$|(?:m?rad|deg|gon|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
+    r"|[_ ]((?:[mun]?s(?:ec)?|[muckd]?m|ft|in|inch|yd)(?:[_/]s2?)?$|(?:m?rad|deg|gon|m?dps)s?(?:[_/]s)?(?=_[xyz]$|$))"
+    r"|(?<=time|tamp)([mun]s)$"
 )
-"""Unit in the name of a column: in brackets, or at its end; of turns also before the axis."""
+"""Unit in the name of a column: in brackets, or at its end; of turns also before the axis; timeus."""
 
 
 def unit_of(name: str) -> str:
@@ -49,7 +55,7 @@ def unit_of(name: str) -> str:
     'rad s'
     """
     stated = STATED.search(name.lower())
-    words = (stated[1] or stated[2] or "") if stated else ""
+    words = (stated[1] or stated[2] or stated[3] or "") if stated else ""
     for symbol, spelt in SPELT:
         words = re.sub(rf"(?<![a-z])({spelt})(?![a-z])", symbol, words)
     parts = [part for part in OPERATOR.split(words) if part]

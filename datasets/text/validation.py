@@ -74,8 +74,11 @@ def _nearest(key: str, value: object, known: list[str]) -> str:
     # A table can only mean a table: stages and keys may share names, as track of a stage and of a vehicle.
     others = () if isinstance(value, Mapping) else {k.rpartition(".")[0] for k in known}
     elsewhere = [k for k in known if k.rpartition(".")[2] == last and k not in others]
-    meant = did_you_mean(elsewhere[0], elsewhere) if elsewhere else did_you_mean(last, beside, table + dot)
-    return meant or f"known here are {', '.join(sorted(beside))}"
+    here = f"known here are {', '.join(sorted(beside))}"
+    if not elsewhere:
+        return did_you_mean(last, beside, table + dot) or here
+    # A key of another table may be no more than a namesake.
+    return did_you_mean(elsewhere[0], elsewhere) + (f" {here}" if table and beside else "")
 
 
 def known_keys(kind: type[Params], prefix: str = "") -> Iterable[str]:

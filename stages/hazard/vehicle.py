@@ -63,6 +63,18 @@ class Vehicle(Params):
         return self
 
     @model_validator(mode="after")
+    def _wheels_of_this_vehicle(self) -> Vehicle:
+        # Wheels of the largest tractors are as high as their track is wide; a wheel climbs less than its diameter.
+        for name, ours, most in (
+            ("wheel_diameter", self.wheel_diameter, ("track", 3.0 * self.track)),
+            ("max_step", self.max_step, ("wheel_diameter", 3.0 * self.wheel_diameter)),
+        ):
+            if ours > most[1]:
+                text = f"{name} {ours:g} m is more than three times {most[0]}, {most[1] / 3.0:g} m"
+                raise ValueError(f"{text}: give all lengths in metres, at the scale of the sequence")
+        return self
+
+    @model_validator(mode="after")
     def _belly_clears_what_wheels_climb(self) -> Vehicle:
         if self.max_step > self.clearance:
             raise ValueError(

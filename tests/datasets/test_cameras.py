@@ -156,12 +156,23 @@ def test_opencv_model_by_the_count_of_coefficients(tmp_path, values, model, kept
         ("{Side}CameraMatrix", "{Side}DistCoeffs"),
         ("intrinsic_matrix_{side}", "distortion_{side}"),
         ("CM{n}", "D{n}"),
+        ("K{zero}", "D{zero}"),
+        ("cam{zero}_K", "cam{zero}_D"),
+        ("camera_matrix_{zero}", "dist_coeffs_{zero}"),
     ],
 )
 def test_both_cameras_by_whatever_name(tmp_path, matrix, distortion):
     text = f"R: {numbers(ROTATION)}\nT: {numbers(SHIFT)}\nimage_size: [{SIZE[0]}, {SIZE[1]}]\n"
     for n, side, f in ((2, "right", 510.0), (1, "left", 500.0)):
-        words = {"n": n, "side": side, "SIDE": side.upper(), "Side": side.title(), "l": side[0], "L": side[0].upper()}
+        words = {
+            "n": n,
+            "zero": n - 1,
+            "side": side,
+            "SIDE": side.upper(),
+            "Side": side.title(),
+            "l": side[0],
+            "L": side[0].upper(),
+        }
         text += f"{matrix.format(**words)}: {numbers(np.array([[f, 0, 320], [0, f, 240], [0, 0, 1]]))}\n"
         text += f"{distortion.format(**words)}: {numbers([0.1 * n, 0, 0, 0])}\n"
     left, right = read_cameras(written(tmp_path, text, "rig.yml"))
@@ -614,11 +625,43 @@ T44 = np.block([[ROTATION, SHIFT[:, None]], [np.zeros(3), 1.0]]).tolist()
         (TWO | {"rot": ROTATION.tolist(), "trans": SHIFT.tolist()}, "rot"),
         (SIDED | {"right": SIDED["right"] | {"T_camera_world": T44}}, "right_T_camera_world"),
         (ONE | {"T_cw": T44}, "T_cw"),
+        (TWO | {"R12": ROTATION.tolist(), "T12": SHIFT.tolist()}, "R12"),
+        (TWO | {"stereo_pose": np.array(T44)[:3].tolist()}, "stereo_pose"),
+        (ONE | {"rmat": ROTATION.ravel().tolist(), "baseline": 0.12}, "rmat"),
     ],
 )
 def test_a_pose_under_another_key_is_refused_beside_matrices_too(tmp_path, stated, key):
     with raises("RIL-766", key):
         read_cameras(written(tmp_path, json.dumps(stated)))
+
+
+@pytest.mark.parametrize("key", ["IMU.T_b_c1", "Tbc", "cam_to_velodyne"])
+def test_a_pose_among_other_sensors_is_no_pose_of_two_cameras(tmp_path, key):
+    assert len(read_cameras(written(tmp_path, json.dumps(ONE | {key: T44})))) == 1
+
+
+def test_rotations_of_rectification_state_the_pose_where_nothing_else_does(tmp_path):
+    P = [[500, 0, 320, 0], [0, 500, 240, 0], [0, 0, 1, 0]]
+    turned = [ROTATION.tolist(), np.eye(3).tolist()]
+    rectified = {"R1": turned[0], "P1": P, "R2": turned[1], "P2": [[500, 0, 320, -60], *P[1:]]}
+    left, right = read_cameras(written(tmp_path, json.dumps(TWO | rectified)))
+    T = right.T_camera_reference @ left.T_camera_reference.inverse()
+    np.testing.assert_allclose(T.matrix34, np.column_stack([ROTATION, [-0.12, 0, 0]]), atol=1e-12)
+
+
+@pytest.mark.parametrize("cameras", [ONE, TWO, FIGURES])
+@pytest.mark.parametrize(("key", "value"), [("baseline", 0.12), ("baseline_mm", 120), ("Baseline [cm]", 12)])
+def test_a_baseline_beside_cameras_makes_them_parallel(tmp_path, cameras, key, value):
+    left, right = read_cameras(written(tmp_path, json.dumps(cameras | {key: value}), "rig.json"))
+    np.testing.assert_allclose(centre(right.T_camera_reference), [0.12, 0, 0], atol=1e-12)
+    np.testing.assert_array_equal(left.T_camera_reference.matrix34, np.eye(3, 4))
+    if cameras is ONE:  # a file for each camera
+        assert len(read_cameras(written(tmp_path, json.dumps(cameras | {key: value}), "left.json"))) == 1
+
+
+def test_a_text_that_is_no_yaml_is_answered_with_what_is_read(tmp_path):
+    with raises("RIL-100", "MATLAB", "angle of view"):
+        read_cameras(written(tmp_path, "% Calib_Results_stereo.m\nfc_left = [ 700 ; 700 ];\n", "calib.m"))
 
 
 def test_views_of_a_chessboard_are_no_pose_of_the_camera(tmp_path):

@@ -63,6 +63,8 @@ def tiff(values, nodata):
         encoded(".tif", MAP),
         tiff(np.where(MAP == 0, np.float32(-9999), MAP), "-9999"),
         npy(MAP),
+        npy(MAP[None]),
+        npy(MAP[:, :, None]),
         npy(np.asfortranarray(MAP.astype(">f8"))),
         npy(np.where(MAP == 0, np.inf, MAP)),
     ],

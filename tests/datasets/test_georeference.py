@@ -40,6 +40,9 @@ def test_axes_by_hand() -> None:
         ({"origin": ORIGIN, "azimuth_deg": 3.0}, ("crs missing",)),
         ({"crs": "EPSG:999999"}, ("crs", "no known")),
         ({"crs": "EPSG:32633", "origin": (47.07, 15.44, 350.0), "azimuth_deg": 3.0}, ("47.07", "degrees", "easting")),
+        ({"crs": "EPSG:32633", "origin": ORIGIN[1::-1] + ORIGIN[2:], "azimuth_deg": 3.0}, ("exchanged", "EPSG:32633")),
+        ({"crs": "EPSG:32633", "origin": (5e7, 5.2e6, 0), "azimuth_deg": 3.0}, ("does not exist", "EPSG:32633")),
+        ({"crs": "EPSG:3857", "origin": (1814000, 6140000, 0), "azimuth_deg": 3.0}, ("0.67 m", "UTM")),
         ({"crs": "EPSG:4326"}, ("crs", "projected")),
         ({"crs": "WGS84"}, ("crs", "projected")),
         ({"crs": GEODETIC}, ("crs", "projected")),
@@ -56,6 +59,15 @@ def test_what_is_refused(given: dict[str, object], facts: tuple[str, ...]) -> No
 def test_a_crs_of_ones_own_may_begin_at_the_site() -> None:
     own = "+proj=tmerc +lat_0=47.07 +lon_0=15.44 +ellps=WGS84 +units=m"
     assert World(crs=own, origin=(12.5, 7.25, 350.0), azimuth_deg=0.0).place is not None
+
+
+@pytest.mark.parametrize(
+    ("crs", "east", "north"),
+    [("EPSG:3413", 0, -3300000), ("EPSG:5070", 0, 2000000), ("EPSG:31256", 10000, 340000), ("IAU_2015:49910", 0, 0)],
+)
+def test_grids_of_other_places_and_bodies_are_taken(crs: str, east: float, north: float) -> None:
+    """North polar stereographic at 60 degrees, of the United States, of Austria, of Mars."""
+    assert World(crs=crs, origin=(east, north, 0.0), azimuth_deg=0.0).place is not None
 
 
 def test_a_crs_is_known_whatever_files_lie_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

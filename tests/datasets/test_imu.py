@@ -298,10 +298,12 @@ def test_names_of_one_sensor_in_the_usual_order_are_enough(tmp_path):
     ("names", "order"),
     [
         ("t,ax,ay,az,gx,gy,gz", (0, 4, 5, 6, 1, 2, 3)),
+        ("t,gyro_y [rad/s],gyro_x [rad/s],gyro_z [rad/s],acc_z,acc_y,acc_x", (0, 2, 1, 3, 6, 5, 4)),
+        ("timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z", (0, 1, 2, 3, 4, 5, 6)),
         (",time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z", (7, 0, 1, 2, 3, 4, 5, 6)),
         ("gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z,timestamp [s]", (1, 2, 3, 4, 5, 6, 0)),
     ],
-    ids=["accelerations first", "a column of numbers before", "times last"],
+    ids=["accelerations first", "axes in another order", "Kalibr", "a column of numbers before", "times last"],
 )
 def test_columns_in_any_order_are_those_of_their_names(tmp_path, names, order):
     rows = [(t, 0.1, 0.2, 0.3, 1, 2, 9.5, 7) for t in (0.5, 0.6)]
@@ -309,6 +311,15 @@ def test_columns_in_any_order_are_those_of_their_names(tmp_path, names, order):
     assert found.times.tolist() == [0.5, 0.6]
     assert found.rates[0].tolist() == [0.1, 0.2, 0.3]
     assert found.forces[0].tolist() == [1, 2, 9.5]
+
+
+def test_times_without_their_unit_are_no_seconds(tmp_path):
+    rows = [(5 * t, 0, 0, 0, 0, 0, 9.8) for t in range(4)]
+    with raises("RIL-798", "5 s apart", "time_ms"):
+        read_imu(record_file(tmp_path, "t,gx,gy,gz,ax,ay,az", rows))
+    for name, unit in (("time_ms", 1e-3), ("TimeUS", 1e-6)):
+        record = read_imu(record_file(tmp_path, f"{name},gx,gy,gz,ax,ay,az", rows))
+        np.testing.assert_allclose(record.times, 5 * unit * np.arange(4))
 
 
 def test_accelerations_in_multiples_of_gravity_are_converted_where_the_names_say_so(tmp_path):

@@ -92,7 +92,7 @@ def test_pairs_are_told_from_names(tmp_path, files, left, right, pairs):
     assert views.sizes == ((SIZE, SIZE) if files[0].endswith("png") else views.sizes)
 
 
-@pytest.mark.parametrize("name", ["{k}/{side}.png", "{k}/{side}/x.png", "{side}/{k}/x.png"])
+@pytest.mark.parametrize("name", ["{k}/{side}.png", "{k}/{side}_{k}.png", "{k}/{side}/x.png", "{side}/{k}/x.png"])
 def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path, name):
     write_images(tmp_path, [name.format(k=k, side=side) for k in (9, 10, 11) for side in ("left", "right")])
     views = inspect(tmp_path).views
@@ -240,10 +240,12 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["time,latitude,longitude,altitude", "0,48,9,2"], "positions"),
         (["time,lat,lon,alt,roll,pitch,yaw", "0,48,9,2,0.1,0.2,3"], "positions"),
         (["#Label,X/Longitude,Y/Latitude,Z/Altitude", *(f"0{k}.jpg,9,48,2" for k in range(4))], "positions"),
+        (["#Label,X/Easting,Y/Northing,Z,Yaw,Pitch,Roll", *(f"{k}.jpg,9,8,2,1,2,3" for k in range(4))], "positions"),
         (["image,easting,northing", *(f"img_{k}.jpg,9,48" for k in range(4))], "positions"),
         (["east north", "1 2", "3 4"], "positions"),
         (["east north", "1 2", "3 4", "5 6"], ""),
         (["0.0", "0.5"], "times"),
+        (["# id timestamp image_name", "0 1600000000.1 a.png", "1 1600000000.2 b.png"], "times"),
         (["0.0", "0.5", "1.0"], ""),
         (["00000 1600000000.1 5.0", "00001 1600000000.2 5.0"], ""),
         (["hello", "1 of these"], ""),
@@ -338,6 +340,25 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     assert "left/3.jpg" in told
 
 
+def test_places_in_images_become_a_table(tmp_path):
+    from PIL import Image
+
+    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "2", "3"]))
+    place = Image.Exif()
+    place.get_ifd(0x8825).update({1: "N", 2: (48.0, 6.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.0)})
+    for name in ("1", "2"):
+        Image.new("L", SIZE).save(tmp_path / f"left/{name}.jpg", exif=place)
+    assert any("EXIF of 2 of 3 left images" in line and "exiftool" in line for line in inspect(tmp_path).unread)
+
+
+def test_kinds_of_images_in_turns_are_one_set(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "3", "5"]) + both("{side}/{name}.jpg", ["2", "4"]))
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs, views.others) == ("left/*", "right/*", 5, ())
+    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "3", "5"]))  # each png once more, as a jpg
+    assert inspect(tmp_path).views.pairs == 5
+
+
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
     write_images(tmp_path, days)
@@ -430,13 +451,14 @@ def test_a_calibration_in_millimetres_opens_once_its_unit_is_said(tmp_path):
     assert open_manifest(path, Digests()).rig.baseline == pytest.approx(0.12)
 
 
-def test_two_files_are_left_and_right(tmp_path):
-    write_images(tmp_path, ["left4.png", "right4.png"])
-    for side, x in (("left", 0.0), ("right", 0.1)):
-        (tmp_path / f"cam_{side}.tsai").write_text(TSAI.format(x=x))
+@pytest.mark.parametrize(("left", "right"), [("left", "right"), ("cam2", "cam3"), ("port", "starboard")])
+def test_two_files_are_left_and_right(tmp_path, left, right):
+    write_images(tmp_path, [f"{side}/{k}.png" for side in (left, right) for k in (4, 5, 6)])
+    for side, x in ((left, 0.0), (right, 0.1)):
+        (tmp_path / f"of_{side}.tsai").write_text(TSAI.format(x=x))
     found = inspect(tmp_path)
     assert found.calibration is not None
-    assert found.calibration.files == ("cam_left.tsai", "cam_right.tsai")
+    assert found.calibration.files == (f"of_{left}.tsai", f"of_{right}.tsai")
     assert found.calibration.baseline == pytest.approx(0.1)
     text = manifest_text(found, ".")
     assert needs(text) == []
@@ -600,6 +622,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "d.npy",
         "left/3.heic",
         "r.raw",
+        "cameras.bin",
         "nav.IMG",
         "notes.md",
         "more.pdf",
@@ -619,6 +642,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "1 array (d.npy): python -c",
         "1 image (left/3.heic): ",
         "1 bag (drive.bag)",
+        "1 COLMAP file (cameras.bin): colmap model_converter",
         "1 matrix file (s.npz): if it is the calibration, write it as text",
     ):
         assert words in text
@@ -627,7 +651,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
     assert "gps.txt is NMEA, no table" in text
     assert "3 files (readme.txt and 2 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
-    assert len(found.unread) == 11
+    assert len(found.unread) == 12
     assert all(f"# Not read: {line}" in manifest_text(found, ".") for line in found.unread)
 
 

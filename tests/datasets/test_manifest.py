@@ -39,6 +39,10 @@ def tum(t: float, x: float) -> str:
 # -- what it opens to --------------------------------------------------------------------------------------------------
 
 
+BASE = 1_600_000_000
+"""s; an afternoon of 2020."""
+
+
 def test_smallest_manifest(tmp_path, materialise):
     s = opened(write_sequence(tmp_path))
     assert (s.name, s.frames, s.frame_names) == ("rover", 3, ("00", "01", "02"))
@@ -313,6 +317,8 @@ def test_the_title_of_a_column_of_times_states_their_unit(tmp_path):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", ["time_ms,image", "0,00.png", "500,01.png", "1000,02.png"])
     assert opened(path).times == (0.0, 0.5, 1.0)
+    write_lines(tmp_path / "t.txt", ["time [msec]", "0", "500", "1000"])
+    assert opened(path).times == (0.0, 0.5, 1.0)
     write_lines(path, [path.read_text() + 'unit = "s"'])
     assert opened(path).times == (0.0, 500.0, 1000.0)
 
@@ -329,6 +335,8 @@ def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path):
     for head in ([], ["# secs nsecs"]):
         write_lines(tmp_path / "t.txt", [*head, "1400000000 900000000", "1400000002 0", "1400000003 100000000"])
         assert opened(path).times == pytest.approx((1400000000.9, 1400000002.0, 1400000003.1), abs=1e-6)
+    write_lines(tmp_path / "t.txt", ["sec,nanosec", "1400000000,900000000", "1400000002,0", "1400000003,100000000"])
+    assert opened(path).times == pytest.approx((1400000000.9, 1400000002.0, 1400000003.1), abs=1e-6)
 
 
 def test_a_table_of_other_images_is_refused(tmp_path):
@@ -730,6 +738,7 @@ def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, fil
         ({"text": '[world]\ncrs = "EPSG:32633"\n'}, ("RIL-223", "azimuth_deg")),
         ({"text": "[world]\nup = [0, 0, 0]\n"}, ("RIL-223", "world.up", "0")),
         ({"text": "[vehicle]\nmax_step = 0.5\n"}, ("RIL-223", "max_step", "0.5", "0.2")),
+        ({"text": "[vehicle]\nwidth = 0.5\n"}, ("RIL-223", "cameras.width", "known here are clearance", "track")),
         ({"text": "[vehicle]\nmax_steps = 0.5\n"}, ("RIL-223", "'vehicle.max_steps'", "mean vehicle.max_step?")),
     ],
 )
@@ -940,6 +949,7 @@ NAMED = ["left/02.png,3,30", "left/00.png,1,10", "right/01.png,9,9", "left/01.pn
         ([line.replace("/", "\\").replace(".png", "") for line in NAMED], [1, 2, 3], None),
         ([line.replace("left/", "") for line in NAMED if "right" not in line], [1, 2, 3], None),
         ([*NAMED[:2], "left/01.png,,"], [1, 3], [0, 2]),
+        ([f"./{line}" for line in NAMED[:2]], [1, 3], [0, 2]),
     ],
 )
 def test_positions_by_names_of_images(tmp_path, lines, xs, times):
@@ -949,9 +959,49 @@ def test_positions_by_names_of_images(tmp_path, lines, xs, times):
     path = write_sequence(tmp_path, f"{TIMED if times else ''}{text}")
     found = opened(path).priors["positions"]
     assert ([row[0] for row in found["positions"]], found["times"]) == (xs, times or [0, 1, 2])
+    found = opened(write_sequence(tmp_path, text)).priors["positions"]  # by numbers of pairs
+    assert ([row[0] for row in found["positions"]], found["times"]) == (xs, times or [0, 1, 2])
     write_lines(tmp_path / "gnss.csv", ["image,easting,northing", *(f"other/{k}.png,1,2" for k in range(3))])
     with raises("RIL-803", "0 positions by names of left images for 3 pairs"):
         opened(path)
+
+
+@pytest.mark.parametrize(("step", "told"), [(1, False), (1000, True)])
+def test_positions_of_another_unit_of_time_are_doubted(tmp_path, step, told):
+    write_lines(tmp_path / "p.csv", ["time,x,y", *(f"{k * step},{k},0" for k in range(3))])
+    s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
+    assert [line for line in s.warnings if "RIL-797" in line and "1 of its 3" in line] == list(s.warnings)
+    assert bool(s.warnings) == told
+
+
+@pytest.mark.parametrize(("more", "told"), [("", 1), ("time_offset = -18", 0)])
+@pytest.mark.parametrize("table", ["positions", "truth"])
+def test_gps_time_is_not_that_of_the_images(tmp_path, table, more, told):
+    """As RTKLIB writes it."""
+    write_lines(
+        tmp_path / "p.pos",
+        ["%  GPST  e-baseline(m) n-baseline(m)", *(f"{BASE + 18 * (not told) + k} {k} 0" for k in range(3))],
+    )
+    write_lines(tmp_path / "t.txt", [f"{BASE + k}" for k in range(3)])
+    text = f'[times]\nfile = "t.txt"\n[{table}]\nfile = "p.pos"\n{more}\n' + (
+        "sigma = 0.5\n" if table == "positions" else "max_gap = 2\n"
+    )
+    lines = opened(write_sequence(tmp_path, text)).warnings
+    assert [("RIL-785" in line, "time_offset = -18" in line) for line in lines] == [(True, True)] * told
+
+
+def test_positions_may_be_those_of_poses_with_names(tmp_path):
+    write_lines(tmp_path / "p.csv", ["time,x,y,z,qx,qy,qz,qw", *(f"{k},{k},{10 * k},0,0,0,0,1" for k in range(3))])
+    s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
+    assert s.priors["positions"]["positions"] == [[0, 0, 0], [1, 10, 0], [2, 20, 0]]
+
+
+def test_angles_of_photographs_are_told_and_their_places_are_truth(tmp_path):
+    lines = ["#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll", *(f"{k:02d}.png,{k},5,0,1,2,3" for k in range(3))]
+    write_lines(tmp_path / "p.txt", lines)
+    s = opened(write_sequence(tmp_path, '[truth]\nfile = "p.txt"\n'))
+    assert [row[0] for row in s.truth_positions.positions] == [0, 1, 2]
+    assert [line for line in s.warnings if "RIL-749" in line and "yaw, pitch, roll" in line]
 
 
 def test_without_standard_deviations_sensors_are_no_measurements(tmp_path):

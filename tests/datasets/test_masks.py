@@ -47,6 +47,11 @@ def test_a_mask_that_leaves_less_than_half_may_be_the_wrong_way_round(tmp_path):
     assert "62.5 % of the left" in line
 
 
+def test_a_mask_that_leaves_out_nothing_may_be_drawn_in_its_transparency(tmp_path):
+    (line,) = sequence(tmp_path, np.dstack([np.full_like(body(), 255)] * 3 + [body()]), ("left",)).warnings
+    assert line.startswith("RIL-799")
+
+
 @pytest.mark.parametrize("scale", [1, 255, 65535])
 def test_any_scale_means_the_same(scale):
     drawn = body(1).astype(np.uint16) * scale

@@ -139,11 +139,18 @@ def test_coordinates_that_were_rounded_to_single_precision_are_named_with_their_
     [line] = positions_of(table(way.astype(np.float32)), "auto", {}).warnings
     assert "steps of 0.5 m" in line
     assert positions_of(table(way.round(2)), "auto", {}).warnings == ()
+    assert positions_of(table(way.round()), "auto", {}).warnings == ()
     near = (way - way[0]).astype(np.float32)
     assert positions_of(table(near), "auto", {}).warnings == ()
 
 
-@pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)])
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        *(("time_ms", 1e-3), ("timestamp [ns]", 1e-9), ("t_s", 1.0), ("time", 1.0)),
+        *(("time (milliseconds)", 1e-3), ("time_usec", 1e-6), ("t [sec]", 1.0), ("time [nanosecond]", 1e-9)),
+    ],
+)
 def test_the_name_of_a_column_states_the_unit_of_its_times(tmp_path, name, factor):
     found = read(tmp_path, f"{name},qw,qx,qy,qz\n0,1,0,0,0\n100,1,0,0,0\n")
     assert found.times == (0.0, pytest.approx(100 * factor))
@@ -323,12 +330,34 @@ def test_positions_are_in_the_unit_that_their_columns_state(tmp_path, name):
     np.testing.assert_allclose(found.poses[0].rotation, TURN, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        "%time,field.latitude,field.longitude,field.altitude",
+        "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude",
+        "image,wgs84_lat,wgs84_lon,wgs84_alt",
+        "Bild;Hochwert;Rechtswert;H\N{LATIN SMALL LETTER O WITH DIAERESIS}he",
+        "point,N,E,H",
+    ],
+)
+def test_heights_are_read_by_their_names(tmp_path, names):
+    """Of ROS, EXIF (by exiftool), and surveyors."""
+    rows = "0,48.1,9.0,500\n1,48.2,9.0,501\n".replace(",", ";" if ";" in names else ",")
+    (tmp_path / "p.csv").write_text(f"{names}\n{rows}", encoding="utf-8")
+    assert [place[2] for place in positions_of(read_motion(tmp_path / "p.csv"), "auto", {}).positions] == [500, 501]
+
+
 def test_positions_that_count_downwards_are_turned_upwards(tmp_path):
     """North, east, down, as an IMU's maker has them, and the depth of a vehicle under water."""
-    for header in ("time,north,east,down", "time,northing,easting,depth [m]"):
+    for header in ("time,north,east,down", "time,northing,easting,depth [m]", "time,n,e,d"):
         (tmp_path / "p.csv").write_text(f"{header}\n0,5,2,3\n1,6,2,3.5\n")
         found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
         assert found.positions == ((2.0, 5.0, -3.0), (2.0, 6.0, -3.5))
+
+
+def test_a_column_called_d_counts_downwards_beside_north_and_east_alone(tmp_path):
+    (tmp_path / "p.csv").write_text("time,d,y\n0,5,2\n1,6,2\n")
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {"x": "d"}).positions == ((5.0, 2.0), (6.0, 2.0))
 
 
 def test_positions_of_rtklib(tmp_path):
@@ -339,6 +368,29 @@ def test_positions_of_rtklib(tmp_path):
     path.write_text(text.format("x-ecef", "y-ecef", "z-ecef"))
     with raises("RIL-805", "UTM"):
         positions_of(read_motion(path), "auto", {})
+    path.write_text("%  GPST   latitude(deg) longitude(deg) height(m) Q\n2123 388800.5 48.1 9.0 500 1\n")
+    found = positions_of(read_motion(path), "auto", {})
+    assert (found.times, found.positions[0][2]) == ((388800.5,), 500)
+
+
+@pytest.mark.parametrize("names", ["x,y,z", "ecef_x,ecef_y,ecef_z", "x-ecef(m),y-ecef(m),z-ecef(m)"])
+def test_positions_from_the_centre_of_the_earth_become_metres_of_a_plane(tmp_path, names):
+    """At 48 degrees north and 9 degrees east: an ellipsoid's point by its definition, and ten metres up."""
+    east, north = np.deg2rad(9.0), np.deg2rad(48.0)
+    radius = 6378137.0 / np.sqrt(1.0 - 6.69437999014e-3 * np.sin(north) ** 2)
+    up = np.array([np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)])
+    place = (radius * up) * [1, 1, 1 - 6.69437999014e-3]
+    rows = [",".join(f"{x:.4f}" for x in place + height * up) for height in (0.0, 10.0)]
+    (tmp_path / "p.csv").write_text(f"time,{names}\n0,{rows[0]}\n1,{rows[1]}\n2,0,0,0\n")
+    found = positions_of(read_motion(tmp_path / "p.csv"), "auto", {})
+    np.testing.assert_allclose(found.positions[1][:2], found.positions[0][:2], atol=1e-3)
+    np.testing.assert_allclose(found.positions, [(500000, 5316300.2, 0), (500000, 5316300.2, 10)], atol=1.0)
+    assert [line for line in found.warnings if "EPSG:32632" in line]
+
+
+def test_northings_as_large_as_the_earth_are_no_distance_from_its_centre(tmp_path):
+    (tmp_path / "p.csv").write_text("time,x,y,z\n0,500000,6350000,90\n1,500001,6350000,90\n")
+    assert positions_of(read_motion(tmp_path / "p.csv"), "auto", {}).positions[0] == (500000.0, 6350000.0, 90.0)
 
 
 @pytest.mark.parametrize("steps", ["{1},{0}", "{0},{1}"])

@@ -63,8 +63,17 @@ def test_rows_in_which_nothing_was_measured_are_counted(tmp_path, separator):
     assert t.measured([0], lost=True) == (t, ())
 
 
+def test_rows_that_were_written_twice_count_once(tmp_path):
+    """As messages of ROS; another position at the same time stays, and is refused with its line."""
+    kept, lines = table(tmp_path, "time,x,y\n1,2,3\n1,2,3\n2,2,3\n2,2,4\n").measured([0, 1, 2])
+    assert (kept.lines, len(lines)) == ((2, 4, 5), 1)
+    assert "RIL-706" in lines[0]
+
+
 def test_names_that_do_not_fit_the_columns_are_none(tmp_path):
-    assert table(tmp_path, "# recorded in the yard\n1 2 3\n").header == ()
+    for remark in ("recorded in the yard", "groundtruth"):
+        read = table(tmp_path, f"# {remark}\n1 2 3\n")
+        assert (read.header, read.columns) == ((), 3)
 
 
 def test_a_name_may_stand_first_in_a_row(tmp_path):
@@ -115,6 +124,7 @@ def test_names_in_brackets_are_no_json(tmp_path):
         ("[\n  [1, 2, 3],\n  [4, 5, 6]\n]\n", ("RIL-979", "JSON")),
         ('\n<?xml version="1.0"?>\n<gpx>\n</gpx>\n', ("RIL-979", "XML")),
         ("$GPGGA,122640,4900.03,N,824.1,E\n$GPRMC,122640,A\n", ("RIL-979", "NMEA")),
+        ("1600000000.5 $GNGGA,122640,4900.03,N,824.1,E\n", ("RIL-979", "NMEA")),
         ("time,x\n2020-09-13,1\n", ("RIL-286", "t.csv", "'2020-09-13,1'")),
     ],
 )
@@ -122,6 +132,11 @@ def test_what_is_wrong_names_the_line(tmp_path, text, expected):
     with raises(*expected) as caught:
         table(tmp_path, text).numbers([0, 1])
     assert caught.value.remedy
+
+
+def test_a_last_row_that_was_cut_off_is_left_out(tmp_path):
+    """As by a recorder that was switched off."""
+    assert table(tmp_path, "time,x,y\n1,2,3\n4,5").rows == (("1", "2", "3"),)
 
 
 def test_a_missing_or_binary_file(tmp_path):

@@ -186,7 +186,8 @@ def test_points_have_the_colours_of_the_left_image(pair: rille.StereoPair, dispa
         '[images]\nleft = "left.png"\nright = "right.png"\n[cameras]\nfx = 300.0\ncx = 142.0\ncy = 129.5\n'
         "[rig]\nbaseline = 0.1\n"
     )
-    cloud = rille.points(disparity, rille.open(tmp_path / "m.toml")[0], every=5)
+    with pytest.warns(UserWarning, match="RIL-796"):
+        cloud = rille.points(disparity, rille.open(tmp_path / "m.toml")[0], every=5)
     column, row = cloud.pixel.values.T
     there = grey[row, column]
     np.testing.assert_array_equal(cloud.colour, np.stack([there, there // 3, there // 2], axis=1))
@@ -208,7 +209,8 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         (lambda data: rille.terrain(data, pair), pair.left, "rille.match"),
         (rille.hazards, disparity, "rille.terrain"),
         (rille.path, dem, "rille.hazards"),
-        (rille.hazards, np.zeros((3, 3)), "rille.terrain"),
+        (rille.hazards, np.zeros((3, 3)), "rille.reconstruct(..., vehicle="),
+        (lambda data: rille.points(data, pair), np.zeros((260, 285)), "[disparity] of a manifest"),
     ):
         with raises("RIL-864", maker):
             step(other)
@@ -230,6 +232,18 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         rille.hazards(dem, vehicle={"wings": 2})
     with raises("RIL-027", "path.target = 3"):
         rille.path(rille.hazards(dem), goal=3)  # type: ignore[arg-type]
+
+
+def test_the_disparity_of_another_pair_is_named(pair: rille.StereoPair, disparity: Any, tmp_path: Path) -> None:
+    other, own = pair.sequence[1], np.asarray
+    disparity.to_netcdf(tmp_path / "d.nc")
+    for step in (rille.terrain, rille.points):
+        with pytest.warns(UserWarning, match=r"RIL-796.* left image of pair 1 of mockup-short"):
+            step(xarray.load_dataset(tmp_path / "d.nc"), other)
+    with pytest.warns(UserWarning, match=r"RIL-796.* right image of pair 0"):
+        rille.points(rille.match(own(pair.left), other.right, preset="fast"), pair)
+    of_arrays = rille.match(own(pair.left), own(pair.right), preset="fast")  # such as images that a user has sharpened
+    assert rille.points(of_arrays, pair, every=9).sizes["point"] > 100
 
 
 def test_what_a_user_draws_into_an_image_stays_with_them() -> None:

@@ -92,7 +92,7 @@ class Inspection:
         self.frames = tuple(f for f in frames if f not in self.lost)
         self.levels: Counter[str] = Counter()
         self.broken: set[tuple[int, str]] = set()
-        self.exchanged = False
+        self.exchanged = self.swapped = False
 
     def say(self, *findings: Finding | None) -> None:
         """Print findings, and count them by level."""
@@ -180,6 +180,7 @@ class Inspection:
         sides = judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names)
         self.say(sides)
         self.exchanged = sides.level == "FAIL"
+        self.swapped = 2 * swapped > len(facts)
         return next((pair for pair in tests if pair not in unlike), whole[0])
 
     def _first_pair(self, pair: int) -> Steps:
@@ -201,7 +202,8 @@ class Inspection:
         if len(left) and not self.exchanged:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
-        self.say(judge.judge_epipolar(oriented.meta))
+        if not self.swapped:  # which is why rows do not fit
+            self.say(judge.judge_epipolar(oriented.meta))
         self.say(judge.judge_repetition(oriented.meta["repeated"]))
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)

@@ -29,3 +29,13 @@ def test_lengths_in_unlike_units_are_refused(bad: dict[str, float]) -> None:
     """With the default of the other one; a vehicle as short as a millionth of its width took minutes to place."""
     with pytest.raises(ValueError, match="give both in metres"):
         Vehicle(**bad)
+
+
+@pytest.mark.parametrize(
+    ("bad", "named"),
+    [({"wheel_diameter": 30}, "wheel_diameter 30 m"), ({"max_step": 12, "clearance": 20}, "max_step 12 m")],
+)
+def test_wheels_and_steps_of_no_vehicle_are_refused(bad: dict[str, float], named: str) -> None:
+    """In centimetres, beside a track in metres; a step that no wheel climbs would make all ground safe."""
+    with pytest.raises(ValueError, match=f"{named} is more than three times .* metres"):
+        Vehicle(**bad)
