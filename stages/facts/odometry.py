@@ -139,6 +139,8 @@ class TrajectoryFacts(Facts):
     world: NotRequired[list[int]]
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
+    contradiction: NotRequired[str]
+    """Of the camera's motions by another sensor that is used."""
 
 
 class MovingFacts(Facts):
