@@ -97,6 +97,8 @@ class AuditFacts(Facts):
     models: list[Json]
     seam_count: int
     seams: list[Json]
+    contradiction: NotRequired[str]
+    """Of most models by their neighbours."""
 
 
 class RadiometryFacts(Facts):
