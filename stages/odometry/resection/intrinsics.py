@@ -220,9 +220,9 @@ def creeping_focus(segments: Sequence[Bundle[ResectFacts]], turn: float, rig: Ri
     if abs(usual) < max(MIN_DISTANCE_PX, error) or -usual / (turn * px_per_yaw(rig)) < 0.3:
         return ""
     return (
-        "the focus of both cameras creeps, and the yaw of the rig was not wrong: with that corrected, landmarks are at "
-        f"other distances than later pairs show, by {usual:+.1f} px of disparity; path and elevations are wrong: keep "
-        "zoom and focus as they were calibrated"
+        "the focus of both cameras creeps, or what is near moves alike (water), and the yaw of the rig was not wrong: "
+        f"with that corrected, landmarks are at other distances than later pairs show, by {usual:+.1f} px of disparity; "
+        "path and elevations are wrong: keep zoom and focus as they were calibrated, mask what moves"
     )
 
 

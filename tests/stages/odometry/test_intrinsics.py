@@ -257,7 +257,7 @@ def test_a_focus_that_creeps_is_told_from_a_wrong_yaw(share, scatter, creeps):
     assert bool(creeping_focus(shown, turn, rig)) == creeps
     assert not creeping_focus(shown, 0.0, rig)
     facts = facts_from(parts, shown=expected, changed=True, before=[0.0, 0.0, 0.0, turn])
-    assert ("focus of both cameras creeps" in facts.get("contradiction", "")) == (share == 1.0)
+    assert ("the focus of both cameras creeps" in facts.get("contradiction", "")) == (share == 1.0)
 
 
 def test_a_yaw_below_half_a_pixel_passes():
