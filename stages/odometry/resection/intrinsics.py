@@ -222,7 +222,8 @@ def creeping_focus(segments: Sequence[Bundle[ResectFacts]], turn: float, rig: Ri
     return (
         "the focus of both cameras creeps, or what is near moves alike (water), and the yaw of the rig was not wrong: "
         "with that corrected, landmarks are at other distances than later pairs show, "
-        f"by {usual:+.1f} px of disparity; path and elevations are wrong: keep zoom and focus as they were calibrated, mask what moves"
+        f"by {usual:+.1f} px of disparity; path and elevations are wrong: keep zoom and "
+        "focus as they were calibrated, mask what moves"
     )
 
 
