@@ -133,7 +133,8 @@ CONTRADICTIONS = ("repeats", "contradiction", "knocked", "misread")
 def contradictions(view: RunView) -> list[str]:
     """List what the images contradict so that no figure may rest on it, one line each."""
     p = view.products
-    facts = [facts_of(view, handle) for handle in (*p.contradictions, *p.rigs.values(), *p.resections)]
+    told = (*p.contradictions, *p.rigs.values(), *p.ground.values(), *p.resections, p.trajectory, p.overlap_audit)
+    facts = [facts_of(view, handle) for handle in told]
     return list(dict.fromkeys(f[key] for f in facts for key in CONTRADICTIONS if key in f))
 
 

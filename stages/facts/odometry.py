@@ -68,7 +68,8 @@ class ResectFacts(Facts):
     calibration (:class:`rille.stages.odometry.resection.calibration_errors.IntrinsicsPart`, ``turn_deg``), and the
     ``bias_px`` of its disparities; empty where nothing was adjusted.
     ``jump`` (column, row, px) and ``knocked``: the rig moved before the pair at the segment's end. ``torn``: share of
-    that pair's disparities that depart otherwise than the others.
+    that pair's disparities that depart otherwise than the others. ``distance_px``: error of all disparities by which
+    landmarks are at wrong distances, as that pair shows it.
     """
 
     per_frame: list[dict[str, Any]]
@@ -77,6 +78,7 @@ class ResectFacts(Facts):
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]
     torn: NotRequired[float]
+    distance_px: NotRequired[float]
 
 
 class IntrinsicsFacts(Facts):
@@ -139,6 +141,8 @@ class TrajectoryFacts(Facts):
     world: NotRequired[list[int]]
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
+    contradiction: NotRequired[str]
+    """Of the camera's motions by another sensor that is used."""
 
 
 class MovingFacts(Facts):

@@ -31,6 +31,8 @@ MAJORITY = 0.7
 """Share of the doubtful factors that have to agree."""
 MAX_ROUNDS, GRADUATION = 40, 2.0
 """Rounds of graduated non-convexity, and the factor that brings each nearer to the truncated cost."""
+MAX_SOURCE = 4.0
+"""Standard deviations from which on an error that many factors share is not believed."""
 STEPS, FEW_STEPS = 30, 3
 """Steps of a whole adjustment, and of one round."""
 
@@ -236,29 +238,41 @@ class Adjusted(NamedTuple):
         """Which factors (m,) count."""
         return self.graph.weight > 0
 
+    @property
+    def strained(self) -> bool:
+        """Whether an error that the whole chain shares is off by more than its excess explains."""
+        shared = self.state.sources[: self.graph.common]
+        return bool((np.abs(shared) > MAX_SOURCE * self.graph.excess).any())
 
-def adjust(graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS) -> Adjusted:
-    """The graph adjusted without the contradicting factors, with the least of the excesses that explains the others.
 
-    If none does, the chain is as exact as stated, and all contradicting factors are left out.
+def adjust(
+    graph: PoseGraph, start: GraphState, excesses: Sequence[float] = EXCESS, share: float = MAJORITY
+) -> Adjusted:
+    """The graph adjusted without the contradicting factors, with the least of the excesses that explains the others,
+    of which most have to agree, and a ``share`` where it is not the first of the excesses.
+
+    If none does, it is the first of the excesses, and all contradicting factors are left out.
     """
     tried = list[Adjusted]()
     for k in excesses:
         tried.append(done := _decided(replace(graph, excess=k), start))
-        if _explained(done):
+        if _explained(done, share if len(tried) > 1 else MAJORITY):
             return done
     return tried[0]
 
 
-def _explained(done: Adjusted) -> bool:
-    """Whether most of the doubtful factors count, with errors that one true graph in a hundred exceeds at most."""
+def _explained(done: Adjusted, share: float) -> bool:
+    """Whether a ``share`` of the doubtful factors counts, with errors that one true graph in a hundred exceeds at
+    most, and the chain is not strained."""
     doubtful = done.graph.factors.doubtful
     rows = int((done.graph.factors.root[doubtful & done.kept] != 0).any(2).sum())
     if not rows:
         return not doubtful.any()
     # The chain alone has as many unknowns as equations, so the doubtful factors are the degrees of freedom.
     squares = 2.0 * done.graph.normal(done.state).cost
-    return bool(done.kept[doubtful].mean() >= MAJORITY and squares <= scipy.special.chdtri(rows, 0.01))
+    return bool(
+        not done.strained and done.kept[doubtful].mean() >= share and squares <= scipy.special.chdtri(rows, 0.01)
+    )
 
 
 def _decided(graph: PoseGraph, state: GraphState) -> Adjusted:

@@ -386,5 +386,6 @@ def ground_frame_stage(
     surely = facts["ground_share"] >= MIN_REFERENCE_SHARE or facts.get("ground_reach", 0.0) >= MIN_REACH_HEIGHTS
     if reference is None and not surely:
         samples, known = sampled(matches, given, params.sigma_disparity), _given_vertical(hint)[0]
-        facts |= {"warnings": [HANGING]} if _hangs(samples, UPRIGHT if known is None else known) else {}
+        if _hangs(samples, UPRIGHT if known is None else known):
+            facts |= {"warnings": [HANGING], **({} if known is None else {"contradiction": HANGING})}
     return Bundle({}, facts)

@@ -95,5 +95,8 @@ def overlap_audit_stage(params: NoParams, seams: Sequence[Bundle[OverlapFacts]])
     }
     if bad:
         words = f"{len(bad)} of {len(models)} elevation models contradict their neighbours by more than their sigma"
-        facts["warnings"] = [f"{words} allows: {told(bad, describe)}"]
+        facts["warnings"] = [line := f"{words} allows: {told(bad, describe)}"]
+        # Of one or a few their own images are the cause, of most the rig, the trajectory or a part of all images.
+        if 2 * len(bad) > len(models):
+            facts["contradiction"] = line
     return Bundle({}, facts)

@@ -166,7 +166,7 @@ def adjust_stage(
         f"frames {given[k]['from']} and {given[k]['to']} alone link their pieces, which are not joined"
         for k in np.flatnonzero(alone)
     ]
-    known, excess, lengths = chain.beside(stated), 1.0, np.zeros(2)
+    known, excess, lengths, contradiction = chain.beside(stated), 1.0, np.zeros(2), {}
     for nodes, inside, done in adjusted_pieces(own, apart, known, sensors):
         excess = max(excess, done.graph.excess)
         lengths += [lengths_along(poses[:, :, 3])[-1] for poses in (own.poses[nodes], done.state.poses[:-1])]
@@ -181,9 +181,10 @@ def adjust_stage(
             text += f"; by {' and '.join(f'[{name}]' for name in sensors.used)} its ways are {longer:.3f} times as long"
             text += ", elevations are not: correct the baseline, or the sensor's unit and scale"
         lines.append(text)
+        contradiction = {"contradiction": text} if excess > sensors.alone else {}
     # Some hold for several pieces alike.
     lines = list(dict.fromkeys([*lines, *sensors.lines]))
-    return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts})
+    return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts, **contradiction})
 
 
 Piece = tuple[NDArray[np.intp], NDArray[np.intp], Adjusted]

@@ -52,6 +52,9 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
 
+MIN_DISTANCE_PX = 0.5
+"""Error of all disparities, as later pairs show it, from which on a corrected yaw was none."""
+
 MAX_BIAS_SCATTER = 0.2
 """Scatter over their size up to which segments agree on an error of all disparities."""
 
@@ -203,6 +206,27 @@ def yaw_contradiction(angle: float, sigma: float, name: str, *, fixed: bool) -> 
     )
 
 
+def creeping_focus(segments: Sequence[Bundle[ResectFacts]], turn: float, rig: Rig) -> str:
+    """One line on a focus that changes in both cameras; empty if the rig's yaw, rad, was rightly corrected by ``turn``.
+
+    From image to image both look alike. But what is turned aside keeps its disparities as it comes nearer, while a
+    corrected yaw that is none puts landmarks at wrong distances, and the pair at a segment's end shows these.
+    """
+    shown = np.array([s.meta["distance_px"] for s in segments if "distance_px" in s.meta])
+    if not turn or len(shown) < MIN_SEGMENTS:
+        return ""
+    usual, error = float(np.median(shown)), 5.0 * mad_sigma(shown) / math.sqrt(len(shown))
+    # 0.3: of the correction. A street whose focus is fixed shows -0.4 to -0.3 px, 0.4 to 2 times the correction others.
+    if abs(usual) < max(MIN_DISTANCE_PX, error) or -usual / (turn * px_per_yaw(rig)) < 0.3:
+        return ""
+    return (
+        "the focus of both cameras creeps, or what is near moves alike (water), and the yaw of the rig was not wrong: "
+        "with that corrected, landmarks are at other distances than later pairs show, "
+        f"by {usual:+.1f} px of disparity; path and elevations are wrong: keep zoom and "
+        "focus as they were calibrated, mask what moves"
+    )
+
+
 def read_out_contradiction(time: float, sigma: float) -> str:
     """One line on a time from the first to the last row, in intervals between frames."""
     return (
@@ -292,8 +316,9 @@ def intrinsics_stage(
     angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed) if off else ""
     bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name) if bent else ""
     rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0])) if late else ""
-    if doubt := "; ".join(filter(None, [rows, bends, cameras, angle if fixed else ""])):
+    creeps = "" if correction.any() else creeping_focus(segments, made[-1], given)
+    if doubt := "; ".join(filter(None, [rows, creeps, bends, cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.
-    facts["warnings"] = [] if correction.any() else [line for line in (rows, bends, angle, cameras) if line]
+    facts["warnings"] = [] if correction.any() else [line for line in (rows, creeps, bends, angle, cameras) if line]
     return Bundle({}, facts)

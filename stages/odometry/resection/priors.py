@@ -7,7 +7,7 @@ most of whose factors the adjusted graph leaves out, is not used.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
-from rille.stages.odometry.pose_graph import EXCESS, MAJORITY, Adjusted, Factors, GraphState, PoseGraph, adjust
+from rille.stages.odometry.pose_graph import (
+    EXCESS,
+    MAJORITY,
+    MAX_SOURCE,
+    Adjusted,
+    Factors,
+    GraphState,
+    PoseGraph,
+    adjust,
+)
 from rille.stages.odometry.resection.sensors import (
     MIN_FIXES,
     MIN_SIGMAS,
@@ -62,7 +71,8 @@ class Sensors:
     """Other sensors of a trajectory by name; ``lines`` collects what is noticed.
 
     ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeference``: the
-    place of the world on Earth, where it is stated. ``facts`` of each sensor.
+    place of the world on Earth, where it is stated. ``facts`` of each sensor; ``alone``: the factor on the camera's
+    errors that places seen again ask for.
     """
 
     used: dict[str, Sensor]
@@ -71,6 +81,7 @@ class Sensors:
     georeference: Mapping[str, Any] | None
     lines: list[str] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
+    alone: float = 1.0
 
     @staticmethod
     def of(given: Mapping[str, Any], frames: int) -> Sensors:
@@ -136,8 +147,9 @@ class Sensors:
         """
         clocks, nodes, common = dict[str, Clock](), len(own.poses), known.shared.shape[2]
         done, whole = None, np.zeros(nodes, np.int32)
+        self.alone = max(self.alone, alone := self._alone(own, known))
         # First the clocks: the remaining errors then show better by how much the chain's exceed its covariances.
-        for excesses in ((1.0,), (1.0,), EXCESS, EXCESS, EXCESS):
+        for last in (False, False, True, True, True):
             said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
             groups = {name: factors for name, factors in said.items() if len(factors.ends)}
             if not groups and not known.doubtful.any():
@@ -148,10 +160,10 @@ class Sensors:
             start = GraphState.of(np.concatenate([own.poses, np.eye(3, 4)[None]]), factors.shared.shape[2])
             if (parts := graph.parts(np.ones(len(ends), bool))).any():
                 return parts[:-1], None
-            done = adjust(graph, start, excesses)
+            done = adjust(graph, start, *(_permitted(alone, groups) if last else ((1.0,),)))
             if (parts := graph.parts(done.kept)).any():
                 return parts[:-1], None
-            if excesses == EXCESS and not self._refused(groups, done, len(known.ends), common):
+            if last and not self._refused(groups, done, len(known.ends), common):
                 break
             clocks = self._clocks(groups, clocks, done, common)
         assert done is not None
@@ -159,8 +171,20 @@ class Sensors:
         self._account(groups, clocks)
         if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
             self._locate(done, positions)
-            self._level(done)
+            # A jump of heights looks like a slope.
+            if not self._contradicted("positions"):
+                self._level(done)
         return whole, done
+
+    def _alone(self, own: OwnTrajectory, known: Factors) -> float:
+        """Factor on the camera's errors that places seen again ask for; infinite if they do not hold a piece together,
+        so that it is not known."""
+        graph = PoseGraph(known, len(own.poses), np.ones(len(known.ends)), common=known.shared.shape[2])
+        if not known.doubtful.any() or not self.used:
+            return 1.0
+        if graph.parts(np.ones(len(known.ends), bool)).any():
+            return math.inf
+        return adjust(graph, GraphState.of(own.poses, graph.common)).graph.excess
 
     def _refused(self, groups: Mapping[str, Factors], done: Adjusted, first: int, column: int) -> bool:
         """Whether a sensor is not believed: most was left out, or what all share is far off its standard deviation.
@@ -180,14 +204,17 @@ class Sensors:
             why = ""
             if np.mean(kept) < MAJORITY:
                 why = f"{(~kept).sum()} of its {len(kept)} measurements contradict the others"
-            # 4.0: standard deviations of what all measurements of a sensor share, from which on it is wrong.
-            elif worst >= 0 and abs(shared[worst]) > 4.0:
+            elif worst >= 0 and abs(shared[worst]) > MAX_SOURCE:
                 error = self.used[name].shared_errors[worst]
                 off = abs(float(shared[worst]))
                 why = f"its {error.name} is off by {off * error.sigma:.2g}{error.unit}, {off:.0f} standard deviations"
             if why:
                 refused = True
                 self._refuse(name, why)
+        if not refused and done.strained and groups:
+            # A vertical is the first that accelerations mislead, and comes last.
+            self._refuse(list(groups)[-1], "the camera's motions cannot be as far off as that")
+            return True
         return refused
 
     def _clocks(
@@ -220,12 +247,14 @@ class Sensors:
                     f"is taken into account: add {-clock.late:.3f} to its time_offset"
                 )
         for name in groups:
-            fact = self.facts[name]
-            # One in a hundred is to be expected.
-            # 0.05: share of a sensor's measurements from which on those that were left out are worth a word.
-            if fact.get("left_out", 0) > 0.05 * fact.get("measurements", 0):
-                count = f"{fact['left_out']} of {fact['measurements']}"
+            if self._contradicted(name):
+                count = f"{self.facts[name]['left_out']} of {self.facts[name]['measurements']}"
                 self.lines.append(f"{TITLES[name]} {count} of its measurements contradict the others and are left out")
+
+    def _contradicted(self, name: str) -> bool:
+        """Whether those of a sensor's measurements that were left out are worth a word."""
+        # 0.05: share of them; one in a hundred is to be expected.
+        return bool(self.facts[name].get("left_out", 0) > 0.05 * self.facts[name].get("measurements", 0))
 
     def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
         """State where the world lies in the frame of positions, unless that is given."""
@@ -270,3 +299,17 @@ class Sensors:
                 f"{math.degrees(sigma):.2f}) against their vertical, and elevations with it: for level maps state "
                 f"world.up = [{', '.join(f'{v:.4f}' for v in up)}], which is up in the left camera of its first frame"
             )
+
+
+def _permitted(alone: float, groups: Collection[str]) -> tuple[Sequence[float], float]:
+    """Factors on the camera's errors that are tried, and the share of measurements that have to agree with more than
+    the first.
+
+    Not all that explains a sensor's contradiction: a camera as loose as that follows any error of the sensor. Only
+    positions tell more of a way than the camera does. ``alone``: the factor without sensors.
+    """
+    if not groups or alone == math.inf:
+        return EXCESS, MAJORITY
+    permitted = [k for k in EXCESS if k >= alone]
+    # 0.95: sensors that say that the camera errs more than stated have to agree with themselves.
+    return permitted if "positions" in groups else permitted[:1], 0.95

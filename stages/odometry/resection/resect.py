@@ -223,15 +223,16 @@ class ResectInputs(NamedTuple):
     rig_after: Bundle[CalibrationFacts] | None = None
 
 
-def jump_of(departs: Floats, grows: Floats) -> Floats:
-    """Jump (2,) of the disparities from one basic pair to the next, px, by their departures (point, 2).
+def jump_of(departs: Floats, grows: Floats) -> tuple[Floats, Floats]:
+    """Jump (2,) of the disparities from one basic pair to the next, px, by their departures (point, 2); and the error
+    (2,) of all disparities, px, by which landmarks are at wrong distances.
 
     A rig that was wrong from the start puts landmarks at wrong distances: their disparities then depart by as much as
     they grow, (point,), as a share. A jump is the departure of landmarks that keep their disparity, and of most others.
     """
     line = np.stack([np.ones(len(grows)), grows], axis=1)
-    kept = irls(line, departs, lambda off: cauchy(off, MIN_JUMP_PX), 1e-6 * np.eye(2))[0]
-    return min(np.median(departs, axis=0), kept, key=np.linalg.norm)
+    kept, grown = irls(line, departs, lambda off: cauchy(off, MIN_JUMP_PX), 1e-6 * np.eye(2))
+    return min(np.median(departs, axis=0), kept, key=np.linalg.norm), grown
 
 
 def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs) -> dict[str, Any]:
@@ -267,13 +268,14 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     departs = (off[1][use] - off[0][use]) / unit
     # Of disparities beyond those at infinity, whatever the angles of the cameras.
     grows = depth[0][use] / depth[1][use] - 1.0
-    jump = jump_of(departs, grows)
+    jump, grown = jump_of(departs, grows)
     torn = float((np.linalg.norm(departs - np.median(departs, axis=0), axis=1) > 2 * MIN_JUMP_PX).mean())
     # 0.25: of the landmarks; fewer are left of a wide turn, at the rim of the view, where disparities are worst.
     if torn > MAX_TORN_SHARE and use.sum() >= 0.25 * len(use):
         return {"torn": torn}
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
-        return {}
+        farther = then.centre[:2] / np.linalg.norm(then.centre[:2])
+        return {"distance_px": float(grown @ farther) * unit}
     line = (
         f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
         f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"

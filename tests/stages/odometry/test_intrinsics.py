@@ -28,7 +28,13 @@ from rille.stages.odometry.resection.calibration_errors import (
     toed_in,
     with_errors,
 )
-from rille.stages.odometry.resection.intrinsics import IntrinsicsParams, common_errors, intrinsics_stage
+from rille.stages.odometry.resection.intrinsics import (
+    IntrinsicsParams,
+    common_errors,
+    creeping_focus,
+    intrinsics_stage,
+    px_per_yaw,
+)
 from rille.stages.odometry.resection.landmarks import SegmentPoints, triangulated
 from rille.stages.odometry.resection.resect import resect_segment
 from rille.stages.odometry.resection.robust_pose import ResectParams
@@ -119,13 +125,14 @@ def facts_of(
     return facts_from([segment(seed, given, lens, turn, yaw, base) for seed in range(segments)], turn, changed, **known)
 
 
-def facts_from(segments, turn: float = 0.0, changed: bool = False, **known):
-    """The same of given segments that turn by some radians."""
+def facts_from(segments, turn: float = 0.0, changed: bool = False, shown: float = 0.0, **known):
+    """The same of given segments that turn by some radians; ``shown``: distances by later pairs, px of disparity."""
     parts = []
     for tracks, state, cameras in segments:
         end = adjust(tracks, state, PARAMS).state
         part = contribution(SegmentAdjustment(tracks, PARAMS), end, cameras)
-        parts.append(Bundle({}, {"per_frame": [], "intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}}))
+        said = {"per_frame": [], "intrinsics": part._asdict() | {"turn_deg": 57.3 * turn}, "distance_px": shown}
+        parts.append(Bundle({}, said))
     rig = Bundle({}, {"rig": cameras.rig.to_dict(), "changed": changed})
     known = {"given": cameras.rig.to_dict(), **known}
     return intrinsics_stage.run(IntrinsicsParams(), known, {"segments": parts, "rig": rig}).meta
@@ -239,6 +246,19 @@ def test_a_rig_that_bends_along_the_way_is_named(step, segments):
     if doubt:
         change = float(doubt.split("turns by ")[1].split()[0])
         assert change == pytest.approx(np.degrees(-step * (segments - 1)), rel=0.2)
+
+
+@pytest.mark.parametrize(("share", "scatter", "creeps"), [(1.0, 0.2, 1), (0.1, 0.1, 0), (-1.0, 0.2, 0), (1.0, 5.0, 0)])
+def test_a_focus_that_creeps_is_told_from_a_wrong_yaw(share, scatter, creeps):
+    """Later pairs show landmarks at other distances by the ``share`` of the yaw that is corrected."""
+    parts = [segment(seed, CAMERA, Lens(CAMERA), 0.0) for seed in range(6)]
+    rig, turn = parts[0][2].rig, 0.005
+    expected = -turn * px_per_yaw(rig) * share
+    shown = [Bundle({}, {"distance_px": expected + scatter * k}) for k in (-2, -1, 0, 1, 2)]
+    assert bool(creeping_focus(shown, turn, rig)) == creeps
+    assert not creeping_focus(shown, 0.0, rig)
+    facts = facts_from(parts, shown=expected, changed=True, before=[0.0, 0.0, 0.0, turn])
+    assert ("the focus of both cameras creeps" in facts.get("contradiction", "")) == (share == 1.0)
 
 
 def test_a_yaw_below_half_a_pixel_passes():

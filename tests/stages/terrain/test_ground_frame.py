@@ -318,6 +318,11 @@ def test_images_that_are_mirrored_top_to_bottom_show_ground_above_the_cameras(pi
         inputs = {"disparity": Bundle(maps, {}), "rig": Bundle({}, {"rig": rig.to_dict()})}
         facts = level_stage.ground_frame_stage.run(PARAMS, {}, inputs).meta
         assert facts.get("warnings") == ([level_stage.HANGING] if warned else None)
+        assert "contradiction" not in facts
+        # A vertical with the wrong sign contradicts the images.
+        reversed_up = {"up": [0.0, 1.0, 0.0]}
+        facts = level_stage.ground_frame_stage.run(PARAMS, reversed_up, inputs).meta
+        assert facts.get("contradiction") == (None if warned else level_stage.HANGING)
 
 
 @pytest.mark.parametrize(("rows", "warned"), [(50, True), (9, False)])

@@ -90,6 +90,14 @@ def test_two_wrong_models_are_both_named() -> None:
     assert [m["pair"] for m in meta["models"] if m["contradicts"]] == [32, PLANTED]
 
 
+def test_where_most_models_contradict_each_other_the_run_is_not_complete() -> None:
+    wrong = {4 * k: 0.004 * k * (-1) ** k for k in range(7)}
+    _, most = audited(along(7, bias=wrong))
+    _, one = audited(along(7, bias={PLANTED: 0.01}))
+    assert most["contradiction"] == most["warnings"][0]
+    assert "contradiction" not in one
+
+
 def test_noise_that_sigma_does_not_know_is_no_error_of_pose() -> None:
     dems = along(7)
     rough = dems[PLANTED]
