@@ -316,7 +316,7 @@ def intrinsics_stage(
     angle = yaw_contradiction(off, facts["yaw"][1], name, fixed=fixed) if off else ""
     bends = bend_contradiction(bent, math.sqrt(bend.covariance[-1, -1]), name) if bent else ""
     rows = read_out_contradiction(late, math.sqrt(read_out.covariance[0, 0])) if late else ""
-    creeps = "" if correction.any() else creeping_focus(segments, made[-1], given)
+    creeps = "" if correction.any() else creeping_focus(segments, made[-1], used)
     if doubt := "; ".join(filter(None, [rows, creeps, bends, cameras, angle if fixed else ""])):
         facts["contradiction"] = doubt
     # Said once, by the last of the corrections.
