@@ -41,7 +41,7 @@ def test_no_package_is_forgotten_or_missing(module):
 
 
 def test_the_algebra_of_these_tests_takes_one_thread():
-    """A plugin of pytest that imports NumPy before the tests set the environment makes some of them ten times slower."""
+    """Where a plugin of pytest imports NumPy before the tests set the environment, some are ten times slower."""
     for path in Path(numpy.__file__).parents[1].glob("numpy.libs/*openblas*"):
         library = ctypes.CDLL(str(path))
         assert library.scipy_openblas_get_num_threads64_() == 1
