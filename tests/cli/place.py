@@ -30,7 +30,10 @@ SMALL = (
 
 SEQUENCE = (*SMALL, "mockup.frames=3")
 
-SETTINGS = """[locus]
+SETTINGS = """[crosscheck]
+enabled = false
+
+[locus]
 cell_size = 0.01
 
 [hfvm]
