@@ -215,8 +215,10 @@ def test_runs(place: Place) -> None:
         state, computed, cached, seconds, posed, *_ = rows[f"other/{run.name}"]
         assert state == "complete"
         assert len(set(posed.split("/"))) == 1
-        assert (int(computed) > 0) == (run == place.runs("other")[0])
-        assert int(computed) + int(cached) > 0 < float(seconds)
+        fresh = run == place.runs("other")[0]
+        assert (int(computed) > 0) == fresh
+        assert int(computed) + int(cached) > 0
+        assert float(seconds) >= 0.1 * fresh  # a run that only looks up ends within a twentieth of a second
     assert place.here("runs", "other").lines[1:] == [line for line in first.lines[1:] if line.startswith("other/")]
 
 
