@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import PurePath
 
-from rille.stages.core.quantities import count
+from rille.stages.core.quantities import count, some
 
 
 def split(what: str, name: str) -> str:
@@ -84,5 +84,4 @@ def unread(names: Iterable[str]) -> list[str]:
 
 def line(kind: str, names: list[str], remedy: str) -> str:
     """Files of a kind in one line: their number, the first one, the remedy."""
-    more = f" and {len(names) - 1} more" if names[1:] else ""
-    return f"{count(len(names), kind)} ({names[0]}{more}): {remedy}"
+    return f"{count(len(names), kind)} ({some(names, 1)}): {remedy}"

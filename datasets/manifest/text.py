@@ -12,7 +12,7 @@ import tomli_w
 from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
 from rille.datasets.manifest.rig import LONGEST_BASELINE
 from rille.datasets.text.names import derived_name
-from rille.stages.core.quantities import count
+from rille.stages.core.quantities import count, some
 
 NEEDED = "NEEDED"
 """Mark of a line that must be filled in before the manifest opens."""
@@ -58,9 +58,7 @@ def needs(text: str) -> list[str]:
 
 def pair_words(views: FoundImages) -> str:
     """Number of pairs, and of those that lack an image, in words."""
-    gaps, words = views.absent, count(views.pairs, "pair")
-    more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
-    return f"{words} ({gaps[0]}{more})" if gaps else words
+    return count(views.pairs, "pair") + (f" ({some(views.absent, 1)})" if views.absent else "")
 
 
 def size_words(sizes: Iterable[tuple[int, int] | None]) -> str:

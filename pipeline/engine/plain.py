@@ -10,7 +10,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from io import TextIOWrapper
 from typing import Any, TextIO
@@ -63,11 +63,6 @@ def brief(value: Any, most: int) -> str:
     """A text, or a value as JSON; of more than ``most`` characters the first, and three dots."""
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= most else f"{text[: most - 3]}..."
-
-
-def some(names: Sequence[str], most: int) -> str:
-    """``a, b, c and 4 more``: the first ``most`` names, and the number of the others."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 @contextmanager

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
-from rille.pipeline.engine.plain import some
 from rille.stages.core.errors import ConfigError, RilleError, did_you_mean
+from rille.stages.core.quantities import some
 
 LEDGER = "ledger.jsonl"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 SMALL = {"m": ("mm", 1000.0, 0.1), "m²": ("cm²", 10000.0, 0.01)}
@@ -26,6 +27,11 @@ def number(value: Any, digits: int = 3) -> str:
 def count(n: int, what: str) -> str:
     """``1 task``, ``3 tasks``."""
     return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """``a, b, c and 4 more``: the first ``most`` names, and the number of the others."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def quantity(value: Any, unit: str) -> str:

@@ -8,7 +8,7 @@ import os
 from dataclasses import asdict
 
 import pytest
-from place import PREPARATION, SETTINGS, Done, Place
+from place import PREPARATION, SETTINGS, STARTED, Done, Place
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +23,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
         if not said.exists():
             (folder / "settings.toml").write_text(SETTINGS)
             empty = Place(folder, {})
-            # The second time in this process, which is faster: nothing is left to compute.
-            call = {name: empty.here if name.endswith(" again") else empty.rille for name in PREPARATION}
+            call = {name: empty.rille if name in STARTED else empty.here for name in PREPARATION}
             found = {name: asdict(call[name](*words)) for name, words in PREPARATION.items()}
             said.write_text(json.dumps(found))
     return Place(folder, {name: Done(**done) for name, done in json.loads(said.read_text()).items()})

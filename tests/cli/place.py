@@ -30,7 +30,10 @@ SMALL = (
 
 SEQUENCE = (*SMALL, "mockup.frames=3")
 
-SETTINGS = """[locus]
+SETTINGS = """[crosscheck]
+enabled = false
+
+[locus]
 cell_size = 0.01
 
 [hfvm]
@@ -72,7 +75,7 @@ COMPUTING = ["--config", "settings.toml", "--jobs", "1"]
 MOCKUP = ["mockup-short", *sets(SEQUENCE), *COMPUTING]
 """The first sequence, with what it is computed with."""
 
-OTHER = ["other", *COMPUTING]
+OTHER = ["other", "--config", "settings.toml", "--executor", "inline"]
 """The second one, a folder of plain files."""
 
 PREPARATION = {
@@ -81,11 +84,14 @@ PREPARATION = {
     "mockup again": ["reconstruct", *MOCKUP, "--progress", "plain"],
     "other": ["reconstruct", *OTHER, "--progress", "plain"],
     "other again": ["reconstruct", *OTHER, "--progress", "plain"],
-    "drive": ["drive", "mockup-loop", *sets(DRIVE), "--jobs", "1", "--progress", "plain"],
-    "drive again": ["drive", "mockup-loop", *sets(DRIVE), "--jobs", "1", "--progress", "plain"],
+    "drive": ["drive", "mockup-loop", *sets(DRIVE), "--executor", "inline", "--progress", "plain"],
+    "drive again": ["drive", "mockup-loop", *sets(DRIVE), "--executor", "inline", "--progress", "plain"],
     "check": ["check", "other"],
     "check again": ["check", "other"],
 }
+
+STARTED = {"export", "mockup", "check"}
+"""Of these, what is started as a user does; the others are called in one process, which is faster."""
 
 
 @dataclass(frozen=True)
@@ -143,12 +149,6 @@ class Place:
             with pytest.raises(SystemExit) as ended:
                 main(list(map(str, words)))
         return Done(int(ended.value.code or 0), out.getvalue(), err.getvalue())
-
-    def twice(self, *words: str | Path, folder: Path | None = None) -> Done:
-        """What a command says, as a user starts it, and the same again in this process."""
-        first = self.rille(*words, folder=folder)
-        assert self.here(*words, folder=folder) == first
-        return first
 
     def made(self) -> set[Path]:
         """Files and folders here, and the folders of all runs."""

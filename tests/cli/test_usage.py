@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from cyclopts import App
@@ -176,9 +177,10 @@ def test_a_word_too_many_is_named(place: Place) -> None:
     assert done.err == "rille: error RIL-001: unexpected 'c.tif'. `rille match --help` says what it takes.\n"
 
 
-def test_a_path_that_looks_like_an_option_is_named_as_one_would_give_it(place: Place) -> None:
-    (place.folder / "-dash dir").mkdir()
-    assert place.here("check", "-dash dir").err.endswith("The path -dash dir is given as ./-dash dir.\n")
+def test_a_path_that_looks_like_an_option_is_named_as_one_would_give_it(place: Place, tmp_path: Path) -> None:
+    (tmp_path / "-dash dir").mkdir()
+    done = place.here("check", "-dash dir", folder=tmp_path)
+    assert done.err.endswith("The path -dash dir is given as ./-dash dir.\n")
 
 
 def test_a_reader_that_has_gone_is_no_traceback() -> None:

@@ -130,10 +130,11 @@ def pixels(sequence, frame, camera):
 
 def test_a_bag_that_unpacks_without_bound_is_refused(tmp_path, monkeypatch):
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    monkeypatch.setattr(bag_images, "MAX_UNPACKED_BYTES", 1 << 28)
+    monkeypatch.setattr(bag_images, "MAX_UNPACKED_BYTES", 1 << 27)
     bag = street("packed")
-    bag.image(LEFT, START - STEP, np.zeros((20_000, 20_000), np.uint8))
-    path = bag.write(tmp_path)
+    assert open_sequence(str(bag.write(tmp_path / "sound"))).frames == 3
+    bag.image(LEFT, START - STEP, np.zeros((14_000, 14_000), np.uint8))
+    path = bag.write(tmp_path / "huge")
     assert sum(file.stat().st_size for file in path.iterdir()) < 1e6
     with raises("RIL-939"):
         open_sequence(str(path))

@@ -4,13 +4,30 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from rille.datasets.mockup import scene
 
 HERE = Path(__file__).parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _each_bed_is_made_once() -> Iterator[None]:
+    """A bed takes a second, and most simulated sequences of these tests have the same one."""
+    made, build = dict[str, Any](), scene.build_scene
+
+    def build_once(*given: object) -> Any:
+        return made.get(str(given)) or made.setdefault(str(given), build(*given))  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(scene, "build_scene", build_once)
+        yield
 
 
 @pytest.fixture

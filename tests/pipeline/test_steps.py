@@ -21,6 +21,8 @@ from rille.pipeline import steps
 from rille.pipeline.cli import main
 from rille.pipeline.engine import events
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.report import summary
+from rille.pipeline.runs import run_files
 
 MOCKUP = {"frames": 3, "image_width": 285, "image_height": 260, "focal_length": 300.0}
 VEHICLE = {"wheel_diameter": 0.05, "track": 0.08, "wheel_base": 0.1, "clearance": 0.03, "max_step": 0.012}
@@ -65,9 +67,11 @@ def test_a_sequence_is_the_same_from_another_folder(pair: rille.StereoPair, tmp_
 
 
 def test_each_step_has_the_values_of_a_run(pair: rille.StereoPair, disparity: Any, dem: Any, tmp_path: Path) -> None:
-    given: Any = {"hfvm": {"preset": "fast"}, "locus": {"cell_size": 0.004}}
+    given: Any = {"hfvm": {"preset": "fast"}, "locus": {"cell_size": 0.004}, "crosscheck": {"enabled": False}}
     places: Any = {"runs": tmp_path / "runs", "cache": tmp_path / "cache", "executor": "inline"}
-    run = rille.reconstruct(pair.sequence, **places, **given)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(run_files, "MODULES", (summary,))  # no files and figures
+        run = rille.reconstruct(pair.sequence, **places, **given)
     keys = {row["label"]: (row["stage"], row["key"]) for row in events.read(run.folder / "ledger.jsonl")}
     store = Store(tmp_path / "cache")
     hazards = rille.hazards(dem)

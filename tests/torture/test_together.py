@@ -54,8 +54,10 @@ def test_three_runs_on_one_cold_cache_with_clearing_beside(programs, calm, tmp_p
     row("three runs on one cold cache, with gc", tries, lost, wrong, computed, expected, f"{sweeps} sweeps of gc")
 
 
-@pytest.mark.parametrize("tries", [1, pytest.param(12, marks=pytest.mark.slow)])
-def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, row, tries):
+@pytest.mark.parametrize(
+    ("tries", "executors"), [(1, 3 * ("inline",)), pytest.param(12, EXECUTORS, marks=pytest.mark.slow)]
+)
+def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, row, tries, executors):
     """What no kept run names and nobody used for long is fair game until the moment it is looked up."""
     lost, wrong, computed, removed, total = [], [], 0, 0, len(calm["digests"])
     for trial in range(tries):
@@ -68,7 +70,7 @@ def test_clearing_takes_old_artifacts_from_under_runs(programs, calm, tmp_path, 
         for path in cache.glob("artifacts/scale/*/*"):  # so that some must be computed from what may go
             if rng.random() < 0.7:
                 path.unlink()
-        found, cleared = together(programs, cache, runs, EXECUTORS, grace=3600)
+        found, cleared = together(programs, cache, runs, executors, grace=3600)
         removed += cleared["removed"]
         for run in found:
             assert run["ok"], [n["why"] for n in run["nodes"].values() if n["digest"] is None]

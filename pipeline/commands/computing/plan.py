@@ -19,7 +19,7 @@ from cyclopts import Parameter
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.memory import words
-from rille.pipeline.engine.plain import brief, some
+from rille.pipeline.engine.plain import brief
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
@@ -28,7 +28,7 @@ from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
-from rille.stages.core.quantities import count
+from rille.stages.core.quantities import count, some
 
 
 def plan(

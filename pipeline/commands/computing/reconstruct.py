@@ -7,11 +7,12 @@ from pathlib import Path
 
 from rille.pipeline.commands import batch
 from rille.pipeline.commands.results.runs import describe
-from rille.pipeline.engine.plain import some, warn
+from rille.pipeline.engine.plain import warn
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
 from rille.stages.core.errors import warning
+from rille.stages.core.quantities import some
 
 
 def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -> int:

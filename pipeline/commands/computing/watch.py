@@ -14,12 +14,13 @@ from rille.datasets.images.arrivals import SETTLE_SECONDS, Arrivals
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.complaints import complain
-from rille.pipeline.engine.plain import some, warned
+from rille.pipeline.engine.plain import warned
 from rille.pipeline.engine.workers import Workers
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import HOLES, INTERRUPTED, WatchOptions, cache_folder
 from rille.stages.core.errors import ConfigError, IncompleteError, InputError, RilleError
+from rille.stages.core.quantities import some
 
 UPDATED = ("trajectory.tum", "trajectory.kitti", "dem.tif", "dem_sigma.tif", "risk.tif", "path.gpkg")
 """Files of each update; all others, COLMAP's trajectory and the figures follow at the end."""

@@ -10,13 +10,14 @@ from typing import Any
 from rille.pipeline.engine import provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import words
-from rille.pipeline.engine.plain import brief, some
+from rille.pipeline.engine.plain import brief
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Run, Runs, cache_folder
 from rille.stages.core.errors import ConfigError, did_you_mean
+from rille.stages.core.quantities import some
 
 SHORT_DIGITS = 12
 """Shown hexadecimal digits of a digest."""

@@ -12,7 +12,6 @@ import os
 import stat
 import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -20,13 +19,6 @@ from functools import lru_cache
 from rille.datasets.text.reading import mark
 
 MANIFEST = "manifest.json"
-
-HEADER = struct.Struct("<4s5H3I2H")
-"""Before each member: signature, three numbers (the last is the compression), date and time, CRC-32, two sizes, lengths
-of name and more."""
-
-END = b"PK\x05\x06"
-"""Beginning of the last 22 bytes of an archive."""
 
 MAX_READ_BYTES = 4_000_000
 """Bound of one reading, and so of the archive's directory, which is read at once: some 40 000 members."""
@@ -93,27 +85,6 @@ def pack(members: Mapping[str, bytes]) -> memoryview:
             # ZipInfo has the fixed date 1980-01-01: with the time of writing equal results would make unequal files.
             archive.writestr(zipfile.ZipInfo(name), data)
     return buffer.getbuffer()
-
-
-@contextmanager
-def manifest(path: str, most: int) -> Iterator[tuple[bytes, int]]:
-    """The manifest in the file of an artifact, of at most ``most`` bytes, and the size of the file, bytes.
-
-    A look-up needs no more: to read the archive's directory would take three times as long. That the file has an end
-    shows that it was not cut off. Errors are those of :func:`opened`.
-    """
-    with _broken(), _RegularFile(path) as raw, io.BufferedReader(raw) as file:
-        whole = os.fstat(file.fileno()).st_size
-        signature, _, _, packing, _, _, checksum, size, _, name, more = HEADER.unpack(file.read(HEADER.size))
-        if (signature, packing, file.read(name)) != (b"PK\x03\x04", zipfile.ZIP_STORED, MANIFEST.encode()):
-            raise BrokenError(f"{MANIFEST} is missing")
-        if more or size > min(most, whole):
-            raise BrokenError(f"{MANIFEST} claims {size} bytes")
-        data = file.read(size)
-        file.seek(-22, os.SEEK_END)
-        if zlib.crc32(data) != checksum or file.read(len(END)) != END:
-            raise BrokenError(f"{MANIFEST} is damaged, or the file is cut off")
-        yield data, whole
 
 
 @contextmanager

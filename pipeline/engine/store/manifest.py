@@ -85,15 +85,15 @@ def read_manifest(path: str, stage: str, key: str) -> Manifest:
     BrokenError, FileNotFoundError
         The file holds no such manifest; there is none.
     """
-    with archive.manifest(path, 256_000_000) as (content, size):
-        manifest: Manifest = json.loads(content)
+    with archive.opened(path) as file:
+        manifest: Manifest = json.loads(file.member(archive.MANIFEST, 256_000_000))
         _Manifest.model_validate(manifest)
         if (manifest["stage"], manifest["key"]) != (stage, key):
             raise BrokenError("the manifest is that of another artifact")
         for name, about in manifest["arrays"].items():
             edges = zip(about["chunks"], about["shape"], strict=True)
             # Bytes of a decoded array for one of the file: lz4 makes 255 of one
-            if _nbytes(about) > 1000 * size or any(edge > max(n, 1) for edge, n in edges):
+            if _nbytes(about) > 1000 * file.size or any(edge > max(n, 1) for edge, n in edges):
                 raise BrokenError(f"{name} claims more than the file holds")
         return manifest
 

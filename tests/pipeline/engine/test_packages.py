@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import importlib.metadata
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy
 import pytest
 from raising import raises
 
@@ -36,6 +38,13 @@ def test_no_package_is_forgotten_or_missing(module):
     assert "numpy" in found
     for name, version in found.items():
         assert version.partition(" ")[0] == importlib.metadata.version(name)
+
+
+def test_the_algebra_of_these_tests_takes_one_thread():
+    """Where a plugin of pytest imports NumPy before the tests set the environment, some are ten times slower."""
+    for path in Path(numpy.__file__).parents[1].glob("numpy.libs/*openblas*"):
+        library = ctypes.CDLL(str(path))
+        assert library.scipy_openblas_get_num_threads64_() == 1
 
 
 def test_packages_come_from_the_imports_of_all_that_is_reached(tmp_path, monkeypatch):

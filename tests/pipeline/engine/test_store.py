@@ -257,9 +257,6 @@ def test_what_no_archive_is_neither_blocks_nor_fills_the_memory(cache, way):
     ref = commit(cache)
     way(file_of(cache))
     began = time.process_time()
-    if way is directory_of_gigabytes:  # which only readers of arrays look at
-        with raises("RIL-504"):
-            Store(cache).open(ref)["elevation"]
     assert Store(cache).lookup("toy", KEY) is None
     assert time.process_time() - began < 1.0
     assert commit(cache) == ref
