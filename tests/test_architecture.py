@@ -116,7 +116,7 @@ def test_every_module_says_what_it_is() -> None:
 
 def test_kernels_are_compiled_in_one_way() -> None:
     """A plain ``njit`` has each divisor checked, which takes several times as long."""
-    assert {name_of(p) for p in MODULES if "njit" in p.read_text(encoding="utf-8")} == {"rille.stages.core.kernel"}
+    assert [name for name, p in MODULES.items() if "njit" in p.read_text(encoding="utf-8")] == ["stages/core/kernel.py"]
 
 
 def test_the_check_itself_sees_a_wrong_import(tmp_path: Path) -> None:
