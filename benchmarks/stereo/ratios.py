@@ -107,7 +107,8 @@ def _name_marks(axis: Any, rows: list[dict[str, Any]]) -> None:
     taken += [Bbox([both.min(axis=0), both.max(axis=0)]).padded(2) for both in marks]
     for row, both in zip(rows, marks, strict=True):
         (x, y), low, high = both[0], both[:, 1].min() - 8, both[:, 1].max() + 8
-        places = ((x, high, "center", "bottom"), (x, low, "center", "top"), (x + 8, y, "left", "center"))
+        above, below = (x, high, "center", "bottom"), (x, low, "center", "top")
+        places = above, below, (x + 8, y, "left", "center"), (x - 8, y, "right", "center")
         for right, up, across, along in places:
             text = axis.text(right, up, row["method"], ha=across, va=along, transform=None)
             box = text.get_window_extent()
