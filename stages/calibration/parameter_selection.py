@@ -5,8 +5,9 @@ that is a few pixels off, and a fit that frees the toe-in lowers the residual at
 parameter is freed only if
 
 1. it is *observed*: its uncertainty, with every other error estimated too
-   (:mod:`rille.stages.calibration.relative_orientation`), changes depth little; or matches beyond infinity show that
-   depth is wrong, and the parameter explains them;
+   (:mod:`rille.stages.calibration.relative_orientation`), changes depth little; or it departs by several standard
+   deviations whatever the principal point; or matches beyond infinity show that depth is wrong, and the parameter
+   explains them;
 2. it is *contradicted*: it differs from the calibration by several of its standard deviations, and a wrong principal
    point is not the likelier cause, as it is if a single angle departs. If an angle departs, the camera was turned, and
    for the other angles one standard deviation is enough;
@@ -232,10 +233,12 @@ class _Chooser:
 
     def _knocked(self, i: int, chosen: list[int]) -> bool:
         """Whether the camera was turned: another angle changed too, or no principal point explains the difference."""
-        if self.impossible or self._turned(i, chosen):
-            return True
+        return self.impossible or self._turned(i, chosen) or self._departs(i, chosen) >= 2.0
+
+    def _departs(self, i: int, chosen: list[int]) -> float:
+        """Standard deviations by which a parameter departs, with the principal point unknown."""
         x, covariance, _ = self._solve([*chosen, i], rival=True)
-        return abs(float(x[i])) >= 2.0 * math.sqrt(float(covariance[i, i]))
+        return abs(float(x[i])) / math.sqrt(float(covariance[i, i]))
 
     def _turned(self, i: int, chosen: list[int]) -> bool:
         """Whether another angle of the rig has changed."""
@@ -259,7 +262,10 @@ class _Chooser:
     def _refusal(self, i: int, chosen: list[int]) -> str | None:
         """Why a parameter is held; None where it is to be freed."""
         asked, error = self._asked(i, chosen), self._depth_error(i, chosen)
-        if error > MAX_DEPTH_ERROR and not self._infinity(i, chosen):
+        # On a street rows ask for half a degree too much. Where matches lie beyond infinity, these say more.
+        far_off = self._departs(i, chosen) >= 2.0 * self.params.significance
+        surely = self._infinity(i, chosen) if self.impossible else far_off
+        if error > MAX_DEPTH_ERROR and not surely:
             off = self.priors.principal[dict(PARTNERS).get(i, 0)]
             return (
                 f"not observed: a principal point that is {off:.1f} px off looks like it, so that "

@@ -68,6 +68,15 @@ def test_an_angle_that_departs_alone_is_likelier_a_principal_point_and_with_othe
     assert freed(both) == {"yaw", "roll"}
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_a_yaw_that_no_principal_point_explains_is_repaired(name):
+    """By three degrees outwards: nothing lies beyond infinity, but all of it is nearer."""
+    rig, depth = SCENES[name]
+    decision = decide(rig, [matches(knocked(rig, yaw_deg=-3.0), depth, pair=k) for k in range(3)], PARAMS)
+    assert "yaw" in freed(decision)
+    assert found(decision)["yaw"] == pytest.approx(-3.0, abs=0.2)
+
+
 def far(rays, rng):
     """A plain to the horizon, half the image beyond 100 m."""
     return np.where(rays[:, 1] > 0.05, 1.65 / np.maximum(rays[:, 1], 0.05), rng.uniform(100, 1000, len(rays)))
