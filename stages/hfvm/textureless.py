@@ -164,8 +164,9 @@ def _update(region, step, sums, state):  # type: ignore[no-untyped-def]
     """Update ``state`` with the sums of one more step; ``sums``: those of the step before, the least of those far
     behind, and the windows' sizes besides."""
     total, previous, passed, size = sums
-    # Numbers of a structure's arrays are read anew for each pixel, one at a time: so they have names of their own.
-    tried, best, least, before, after, rival, claim, claimant = state
+    # Arrays of a structure would be looked up for each pixel, one at a time: so they have names of their own.
+    best, least, rival, tried = state.best, state.least, state.rival, state.tried
+    before, after, claim, claimant = state.before, state.after, state.claim, state.claimant
     for y in range(total.shape[0]):
         for x in range(total.shape[1]):
             if total[y, x] < least[y, x]:
