@@ -240,6 +240,13 @@ class _Chooser:
         x, covariance, _ = self._solve([*chosen, i], rival=True)
         return abs(float(x[i])) / math.sqrt(float(covariance[i, i]))
 
+    def _surely_off(self, i: int, chosen: list[int]) -> bool:
+        """Whether a parameter is wrong by more than what hides it explains."""
+        if self.impossible:  # what lies beyond infinity says more than rows
+            return self._infinity(i, chosen)
+        # Twice: on a street rows ask for half a degree too much.
+        return self._departs(i, chosen) >= 2.0 * self.params.significance
+
     def _turned(self, i: int, chosen: list[int]) -> bool:
         """Whether another angle of the rig has changed."""
         return any(k != i for k in chosen if k < ANGLES)
@@ -262,10 +269,7 @@ class _Chooser:
     def _refusal(self, i: int, chosen: list[int]) -> str | None:
         """Why a parameter is held; None where it is to be freed."""
         asked, error = self._asked(i, chosen), self._depth_error(i, chosen)
-        # On a street rows ask for half a degree too much. Where matches lie beyond infinity, these say more.
-        far_off = self._departs(i, chosen) >= 2.0 * self.params.significance
-        surely = self._infinity(i, chosen) if self.impossible else far_off
-        if error > MAX_DEPTH_ERROR and not surely:
+        if error > MAX_DEPTH_ERROR and not self._surely_off(i, chosen):
             off = self.priors.principal[dict(PARTNERS).get(i, 0)]
             return (
                 f"not observed: a principal point that is {off:.1f} px off looks like it, so that "
