@@ -81,6 +81,7 @@ def irls(
     prior: Floats | None = None,
     start: Floats | None = None,
     rounds: int = 20,
+    tolerance: float = 1e-9,
 ) -> Floats:
     """Unknowns x of ``design @ x = target`` by reweighted least squares, as ``target`` (..., k, m) or (k,).
 
@@ -93,7 +94,7 @@ def irls(
     weigh : weights (..., n) of the lengths (..., n) of the rows' residuals.
     prior : (k, k), information matrix; without it the weighted rows must determine the unknowns.
     start : value of the prior, whose residuals give the first weights; None: zeros, and weights of residuals of 0.
-    rounds : at most; fewer if the unknowns have converged.
+    rounds : at most; fewer if no unknown changes by more than ``tolerance`` times the largest one.
 
     Raises
     ------
@@ -101,17 +102,21 @@ def irls(
         The weighted rows do not determine the unknowns.
     """
     several = target.ndim == design.ndim
-    y = target if several else target[..., None]
-    x = first = np.zeros((*y.shape[:-2], design.shape[-1], y.shape[-1]))
+    y, k = target if several else target[..., None], design.shape[-1]
+    x = first = np.zeros((*y.shape[:-2], k, y.shape[-1]))
     if start is not None:
         x = first = start if several else start[..., None]
     rest = np.zeros(y.shape) if start is None else y - design @ x
-    held = np.zeros(2 * (design.shape[-1],)) if prior is None else prior
+    held = np.zeros(2 * (k,)) if prior is None else prior
+    # Both sides of the normal equations are products of the same rows.
+    rows = np.concatenate([design, y], axis=-1)
+    across = np.ascontiguousarray(np.swapaxes(rows, -1, -2))
     for _ in range(rounds):
-        weighted = np.swapaxes(design * weigh(np.sqrt((rest**2).sum(-1)))[..., None], -1, -2)
-        last, x = x, np.linalg.solve(weighted @ design + held, weighted @ y + held @ first)
-        # 1e-9: nanometres for a height of metres.
-        if np.abs(x - last).max() <= 1e-9 * np.abs(x).max():
+        size = np.sqrt((rest**2).sum(-1)) if several else np.abs(rest[..., 0])
+        products = (across * weigh(size)[..., None, :]) @ rows
+        last, x = x, np.linalg.solve(products[..., :k, :k] + held, products[..., :k, k:] + held @ first)
+        # By default nanometres for a height of metres.
+        if np.abs(x - last).max() <= tolerance * np.abs(x).max():
             break
         rest = y - design @ x
     return x if several else x[..., 0]
