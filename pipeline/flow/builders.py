@@ -366,9 +366,9 @@ class Builder:
 
     # -- the world ----------------------------------------------------------------------------------------------
 
-    def hazards(self, label: str, dems: Series[Handle]) -> Handle:
-        """Add the task that judges hazards on the tiles of an elevation model."""
-        return self.node(risk_stage, label, dem=list(dems), vehicle=self.given_vehicle)
+    def hazards(self, label: str, dems: Series[Handle], use: str | None = None) -> Handle:
+        """Add the task that judges hazards on the tiles of an elevation model; ``use``: see the stage."""
+        return self.node(risk_stage, label, dem=list(dems), vehicle=self.given_vehicle, use=use)
 
 
 def other_plane(config: Any, levels: Series[Any], *, placed: bool) -> Args | None:

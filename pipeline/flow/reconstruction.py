@@ -532,7 +532,7 @@ def local_models(make: Builder, matched: list[BasicPair], first: BasicPair) -> d
         k = one.frame
         pair = pairs[k] = make.pair(k, one.level, one.rig, first)
         if "reference" not in one.level.spec.args:
-            p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem])
+            p.local_risk[k] = make.hazards(f"risk/local/{k}", [pair.dem], use="local")
             p.local_path[k] = make.node(path_stage, f"path/local/{k}", risk=p.local_risk[k], use="local")
         make.graph.flow(assessment.of_pair(make, pair))
     return pairs

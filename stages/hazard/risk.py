@@ -98,13 +98,23 @@ def risk_map(
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
     """Refuse a vehicle that does not fit on the map."""
+    if wide := too_wide(vehicle, shape, cell):
+        remedy = "give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence"
+        raise DegenerateError("RIL-431", wide, remedy=remedy)
+
+
+def too_wide(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> str | None:
+    """How much wider than the map a vehicle is; None where it fits."""
     width, side = 2.0 * vehicle.half_width, min(shape) * cell
-    if width > side:
-        raise DegenerateError(
-            "RIL-431",
-            f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m",
-            remedy="give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence",
-        )
+    return f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m" if width > side else None
+
+
+def _unjudged(z: Floats32) -> dict[str, NDArray[Any]]:
+    """Arrays of a risk map without a cell that is judged."""
+    none = {m.band: np.full_like(z, np.nan) for m in MEASURES}
+    none |= {name: np.full_like(z, np.nan) for name in ("p_hazard", "p_wheel")}
+    whole = {"risk": np.full(z.shape, UNKNOWN, np.uint8), "reason": np.full(z.shape, UNKNOWN_BIT, np.uint16)}
+    return none | whole | {"filled": np.zeros(z.shape, np.uint8), "elevation": z}
 
 
 def window_cells(side: float, cell: float) -> int:
@@ -126,8 +136,13 @@ def window_cells(side: float, cell: float) -> int:
     ],
     memory=Memory(factor=16.0, lower=("locus.cell_size",)),
 )
-def risk_stage(params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = DEFAULT_VEHICLE) -> Bundle[RiskFacts]:
-    """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits."""
+def risk_stage(
+    params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = DEFAULT_VEHICLE, use: str | None = None
+) -> Bundle[RiskFacts]:
+    """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits.
+
+    ``use``: "local" for the map of one pair of a run, which is unknown throughout where the vehicle is wider than it.
+    """
     lattices = [Lattice.from_dict(bundle.meta["lattice"]) for bundle in dem]
     whole = union(lattices)
     z = mosaic([(part, bundle["elevation"]) for part, bundle in zip(lattices, dem, strict=True)], np.nan, whole)
@@ -135,7 +150,9 @@ def risk_stage(params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = 
     names = [next((n for n in ("relief_std", "elevation_std") if n in d.arrays), None) for d in dem]
     stds = [(part, d[name]) for part, d, name in zip(lattices, dem, names, strict=True) if name is not None]
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
-    arrays = risk_map(z.astype(np.float32), s.astype(np.float32), whole.cell, vehicle, params)
+    z, s = z.astype(np.float32), s.astype(np.float32)
+    narrow = use == "local" and too_wide(vehicle, whole.shape, whole.cell)
+    arrays = _unjudged(z) if narrow else risk_map(z, s, whole.cell, vehicle, params)
     meta: RiskFacts = {
         "lattice": whole.to_dict(),
         "frame": dem[0].meta.get("frame", "local"),

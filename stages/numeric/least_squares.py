@@ -109,7 +109,7 @@ def irls(
     rest = np.zeros(y.shape) if start is None else y - design @ x
     held = np.zeros(2 * (k,)) if prior is None else prior
     # Both sides of the normal equations are products of the same rows.
-    rows = np.concatenate([design, y], axis=-1)
+    rows = np.concatenate([np.broadcast_to(design, (*y.shape[:-1], k)), y], axis=-1)
     across = np.ascontiguousarray(np.swapaxes(rows, -1, -2))
     for _ in range(rounds):
         size = np.sqrt((rest**2).sum(-1)) if several else np.abs(rest[..., 0])

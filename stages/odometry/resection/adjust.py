@@ -181,7 +181,8 @@ def adjust_stage(
             text += f"; by {' and '.join(f'[{name}]' for name in sensors.used)} its ways are {longer:.3f} times as long"
             text += ", elevations are not: correct the baseline, or the sensor's unit and scale"
         lines.append(text)
-        contradiction = {"contradiction": text} if excess > sensors.alone else {}
+        # Without sensors places seen again alone ask for it.
+        contradiction = {"contradiction": text} if sensors.used and excess > sensors.alone else {}
     # Some hold for several pieces alike.
     lines = list(dict.fromkeys([*lines, *sensors.lines]))
     return _bundle(trajectory, out, lines, {"excess": excess, "priors": sensors.facts, **contradiction})

@@ -193,6 +193,7 @@ def test_a_chain_whose_errors_exceed_its_covariances_takes_them_times_a_factor()
         assert not [line for line in out.meta["warnings"] if "left out" in line]
         e = errors(out, truth)[1:]
         found.append(out.meta["excess"])
+        assert "contradiction" not in out.meta  # no other sensor says so
         nees.append(np.mean(np.einsum("fi,fij,fj->f", e, np.linalg.inv(out["covariance"][1:]), e)) / 6)
     assert set(found) == {10.0}
     assert 0.5 < np.mean(nees) < 2.0

@@ -14,7 +14,7 @@ from vehicles import SHORT
 from rille.stages.core.declare import Bundle, check_outputs
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import BITS
-from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN
+from rille.stages.hazard.risk import CAUTION, DOUBT_BIT, HAZARDOUS, UNKNOWN, RiskParams, risk_stage
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import PathParams, Route, describe, find_path, nearest_middle, path_stage
 
@@ -351,6 +351,26 @@ def test_a_vehicle_wider_than_the_map_is_refused() -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 5)
     with raises("RIL-431", "0.095", "0.05"):
         find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update={"track": 0.08}))
+
+
+@pytest.mark.parametrize("times", [2.0, 1e5])
+def test_the_map_of_one_pair_may_be_narrower_than_the_vehicle(times: float) -> None:
+    """Its cells are unknown and it has no path; of a whole world that is an error: units may be others."""
+    lattice = Lattice.at(0, 40, CELL, 40, 8)
+    vehicle = SHORT.model_copy(
+        update={name: times * getattr(SHORT, name) for name in ("track", "wheel_base", "wheel_diameter")}
+    )
+    dem = Bundle({"elevation": level(lattice)[1]}, {"lattice": lattice.to_dict(), "frame": "local"})
+    given = {"vehicle": vehicle.model_dump()}
+    risk = risk_stage.run(RiskParams(), given | {"use": "local"}, {"dem": [dem]})
+    check_outputs(risk_stage, risk)
+    assert risk.meta["shares"]["unknown"] == 1.0
+    path = path_stage.run(PathParams(), {"use": "local"}, {"risk": risk})
+    check_outputs(path_stage, path)
+    assert not path.meta["found"]
+    assert "the map only 0.08 m" in path.meta["reason"]
+    with raises("RIL-431", "0.08"):
+        risk_stage.run(RiskParams(), given, {"dem": [dem]})
 
 
 def test_limits_that_leave_nothing_to_drive_on_are_named() -> None:
