@@ -262,8 +262,7 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     assert p.trajectory is not None
     positions = dict(zip(frames, posed.meta["positions"], strict=True))
     row = {frame: k for k, frame in enumerate(frames)}
-    start, end = posed.meta["pieces"][posed.meta["main"]]
-    world = set(posed.meta.get("world", range(start, end + 1)))
+    world = posed.meta["pieces"][posed.meta["main"]]
     # Pairs of other pieces have poses in frames of their own, whose place in this world is unknown.
     there = [k for k in pairs if k in world and positions[k]]
     for k in there:
@@ -292,7 +291,7 @@ def merged_world(make: Builder, frames: Series[int], pairs: Mapping[int, Pair], 
     yield Complete(("radiometry", "merge"))
     if p.local_risk:
         p.world_risk = make.hazards("risk/world", p.world_tiles)
-        begin = positions[start]
+        begin = positions[world[0]]
         p.world_path = make.node(path_stage, "path/world", risk=p.world_risk, use="world", begin=begin and begin[:2])
     yield from assessment.of_world(make, [pairs[k] for k in there])
 

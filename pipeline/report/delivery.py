@@ -16,8 +16,7 @@ import numpy as np
 from rille.pipeline.export.view import UNSTATED, RunView, TaskRow
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
-from rille.pipeline.report.words import spans
-from rille.stages.core.quantities import count, metres, some
+from rille.stages.core.quantities import count, metres, some, spans
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, REFERENCE_PLANE
 
 Rows = list[dict[str, Any]]

@@ -18,8 +18,7 @@ from rille.pipeline.export.catalogue import listed
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.summary import summarise
-from rille.pipeline.report.words import spans
-from rille.stages.core.quantities import metres, number, quantity
+from rille.stages.core.quantities import metres, number, quantity, spans
 from rille.stages.hazard.measures import MEASURES
 
 

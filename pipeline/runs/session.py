@@ -178,8 +178,10 @@ def perform(
     remember()
     report = _write(opened, result, made)
     _point_latest(opened.folder)
-    valid = (h.ref for h in opened.graph.nodes if h.ref is not None and h.index not in opened.graph.outdated)
-    suspicious = (line for ref in valid for line in ref.meta.get("warnings", ()))
+    products, outdated = opened.view.products, opened.graph.outdated
+    # What the trajectory lacked before it was adjusted is no matter.
+    valid = (h for h in opened.graph.nodes if h.index not in outdated and h is not products.chained)
+    suspicious = (line for h in valid if h.ref is not None for line in h.ref.meta.get("warnings", ()))
     # Warnings of tasks and of the report (which follow from several tasks); those of the input came before the run.
     for line in dict.fromkeys((*suspicious, *report["warnings"])):
         if line not in opened.view.sequence.warnings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -32,6 +33,14 @@ def count(n: int, what: str) -> str:
 def some(names: Sequence[str], most: int) -> str:
     """``a, b, c and 4 more``: the first ``most`` names, and the number of the others."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """``[1, 2, 3, 7]`` to ``1-3, 7``."""
+    # Along successive numbers, the number less its place in the list stays the same.
+    groups = itertools.groupby(enumerate(numbers), key=lambda at: at[1] - at[0])
+    runs = [[n for _, n in group] for _, group in groups]
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 
 def quantity(value: Any, unit: str) -> str:

@@ -120,9 +120,9 @@ class PlacesFacts(Facts):
 class TrajectoryFacts(Facts):
     """Poses of all frames in the world, which is that of piece number ``main``.
 
-    Where it was adjusted (stage ``adjust``) a piece need not be a range: ``world`` are the frames of the main one.
-    ``excess`` is then the factor by which the chain's errors exceed the covariances that were stated for it, and
-    ``priors`` tells of each other sensor whether it was used, of how many measurements were left out, and its clock.
+    Where it was adjusted (stage ``adjust``) ``excess`` is the factor by which the chain's errors exceed the covariances
+    that were stated for it, and ``priors`` tells of each other sensor whether it was used, of how many measurements
+    were left out, and its clock.
     """
 
     frames: list[int]
@@ -132,13 +132,16 @@ class TrajectoryFacts(Facts):
     verticals: list[str]
     """Source of the vertical of each piece."""
     pieces: list[list[int]]
-    """First and last frame of each."""
+    """Frames of each."""
     main: int
     posed: int
     in_world: int
     lost: list[dict[str, Any]]
     """Frame, cause, and the frames between which it is bridged."""
-    world: NotRequired[list[int]]
+    breaks: list[dict[str, Any]]
+    """First frame of a piece, and why it is not of the piece before, where that is known."""
+    unlike_verticals: list[str]
+    """Warnings of pairs whose ground contradicts the vertical of their piece."""
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
     contradiction: NotRequired[str]

@@ -111,10 +111,10 @@ def too_wide(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> str | Non
 
 def _unjudged(z: Floats32) -> dict[str, NDArray[Any]]:
     """Arrays of a risk map without a cell that is judged."""
-    none = {m.band: np.full_like(z, np.nan) for m in MEASURES}
+    none: dict[str, NDArray[Any]] = {m.band: np.full_like(z, np.nan) for m in MEASURES}
     none |= {name: np.full_like(z, np.nan) for name in ("p_hazard", "p_wheel")}
-    whole = {"risk": np.full(z.shape, UNKNOWN, np.uint8), "reason": np.full(z.shape, UNKNOWN_BIT, np.uint16)}
-    return none | whole | {"filled": np.zeros(z.shape, np.uint8), "elevation": z}
+    none |= {"risk": np.full(z.shape, UNKNOWN, np.uint8), "reason": np.full(z.shape, UNKNOWN_BIT, np.uint16)}
+    return none | {"filled": np.zeros(z.shape, np.uint8), "elevation": z}
 
 
 def window_cells(side: float, cell: float) -> int:

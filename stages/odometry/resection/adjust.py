@@ -233,12 +233,12 @@ def _bundle(
     kept, out.piece[out.piece >= 0] = np.unique(out.piece[out.piece >= 0], return_inverse=True)
     frames = before.meta["frames"]
     verticals = [before.meta["verticals"][k] for k in kept]
-    facts = account(frames, out, {int(one["frame"]): one["cause"] for one in before.meta["lost"]}, verticals)
+    causes = {int(one["frame"]): one["cause"] for one in (*before.meta["lost"], *before.meta["breaks"])}
+    facts = account(frames, out, causes, verticals)
     meta: TrajectoryFacts = {
         **before.meta,
         **facts,  # type: ignore[typeddict-item]
-        "world": [frame for frame, k in zip(frames, out.piece, strict=True) if k == facts["main"]],
         **more,
-        "warnings": [*facts["warnings"], *lines],
+        "warnings": [*facts["warnings"], *before.meta["unlike_verticals"], *lines],
     }
     return Bundle(vars(out), meta)

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.core.quantities import spans
 from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, TrajectoryFacts
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal, rotation_exp
@@ -240,11 +241,12 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
         "verticals": list(verticals),
-        "pieces": [[frames[rows[0]], frames[rows[-1]]] for rows in members],
+        "pieces": [[frames[k] for k in rows] for rows in members],
         "main": main,
         "posed": len(posed),
         "in_world": int((piece == main).sum()),
         "lost": lost,
+        "breaks": [{"frame": k, "cause": causes[k]} for k in (frames[rows[0]] for rows in members[1:]) if k in causes],
     }
     return facts | {"warnings": list(_missing(frames, facts, causes))}
 
@@ -271,14 +273,14 @@ def _missing(frames: Sequence[int], facts: Mapping[str, Any], causes: Mapping[in
             yield f"frame {first['frame']} lost: {first['cause']}; {how}"
     pieces = facts["pieces"]
     if len(pieces) > 1:
-        words = ", ".join(f"piece {k}: frames {a}-{b}" for k, (a, b) in enumerate(pieces, start=1))
-        where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, _ in pieces[1:])
+        words = ", ".join(f"piece {k}: frames {spans(piece)}" for k, piece in enumerate(pieces, start=1))
+        where = ", ".join(f"before frame {a} ({causes.get(a, 'no motion found')})" for a, *_ in pieces[1:])
         world = f"each in its own frame, the world is that of piece {facts['main'] + 1}, the largest"
         yield f"the trajectory is broken {where}: {words}; {world}"
-    for (a, b), source in zip(pieces, facts["verticals"], strict=True):
+    for piece, source in zip(pieces, facts["verticals"], strict=True):
         if source == NO_VERTICAL:
-            world = f"their world is that of camera {a}, whose own up is z"
-            yield f"nothing tells of the vertical at frames {a}-{b}: {world}"
+            world = f"their world is that of camera {piece[0]}, whose own up is z"
+            yield f"nothing tells of the vertical at frames {spans(piece)}: {world}"
 
 
 def _moved(frames: list[int], steps: Sequence[tuple[float | None, float]]) -> dict[int, str]:
@@ -343,6 +345,7 @@ def trajectory_stage(
         "frames": frames,
         "inliers": [inliers.get(f, 0) for f in frames],
         **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
+        "unlike_verticals": list(_unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)),
     }
-    meta["warnings"] += _unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)
+    meta["warnings"] += meta["unlike_verticals"]
     return Bundle(vars(found), meta)

@@ -82,7 +82,7 @@ def test_a_lost_frame_is_bridged_and_no_pyramid_is_made_twice() -> None:
         [{"bridges": [(2, 4)], "sides": [2, 3, 4]}, {"bridges": [], "sides": [5]}],
         {"chain": [0, 1, 2, 4, 5, 6, 7], "lost": [{"frame": 3, "cause": "black"}], "unfit": [5]},
         {"basic": [0, 3, 5], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6]]},
-        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        {"frames": list(range(8)), "pieces": [list(range(8))], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
     )
     assert labels(graph, "frame_screening") == ["frame_screening", "frame_screening/1", "frame_screening/2"]
     assert labels(graph, "swap_check") == ["swap_check/2", "swap_check/3", "swap_check/4", "swap_check/5"]
@@ -104,7 +104,7 @@ def test_wrong_cameras_are_corrected_in_all_that_rests_on_them_and_nothing_else_
         [],
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
-        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        {"frames": list(range(8)), "pieces": [list(range(8))], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
         cameras=[[-0.1, 0.0, 0.0, 0.0]],
     )
     assert labels(graph, "intrinsics") == ["intrinsics", "intrinsics/anew"]
@@ -125,7 +125,7 @@ def test_nothing_is_asked_of_a_vehicle_where_no_pair_sees_ground(sees_ground: bo
         [],
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 4], "segments": [[0, 1, 2, 3, 4], [4, 5, 6, 7]]},
-        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        {"frames": list(range(8)), "pieces": [list(range(8))], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
         ground=GROUND if sees_ground else WALL,
     )
     kind = "ground_frame" if sees_ground else "reference_plane"
@@ -204,7 +204,12 @@ def test_the_world_is_that_of_the_largest_piece() -> None:
         [],
         {"chain": list(range(8)), "lost": [], "unfit": []},
         {"basic": [0, 3, 6], "segments": [[0, 1, 2, 3], [3, 4, 5, 6], [6, 7]]},
-        {"frames": list(range(8)), "pieces": [[0, 2], [3, 7]], "main": 1, "positions": [[0, 0, k] for k in range(8)]},
+        {
+            "frames": list(range(8)),
+            "pieces": [[0, 1, 2], [3, 4, 5, 6, 7]],
+            "main": 1,
+            "positions": [[0, 0, k] for k in range(8)],
+        },
         resect={"joint": False},
     )
     assert list(products.world_dem) == [3, 6]
@@ -231,7 +236,7 @@ def test_what_many_tasks_are_given_is_held_once() -> None:
         [],
         {"chain": list(range(FRAMES)), "lost": [], "unfit": []},
         {"basic": [0, 3, 5], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6, 7]]},
-        {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
+        {"frames": list(range(8)), "pieces": [list(range(8))], "main": 0, "positions": [[0, 0, k] for k in range(8)]},
     )
     for name, least in (("rig", 3), ("vehicle", 3)):
         # The simulator's truth is of the true rig, which is another one.
@@ -242,7 +247,7 @@ def test_what_many_tasks_are_given_is_held_once() -> None:
 
 WHOLE = {"chain": list(range(FRAMES)), "lost": [], "unfit": []}
 CHOICE = {"basic": [0, 3, 5, 6], "segments": [[0, 1, 2, 3], [3, 4, 5], [5, 6], [6, 7]]}
-POSED = {"frames": list(range(8)), "pieces": [[0, 7]], "main": 0, "positions": [[0, 0, k] for k in range(8)]}
+POSED = {"frames": list(range(8)), "pieces": [list(range(8))], "main": 0, "positions": [[0, 0, k] for k in range(8)]}
 
 
 def test_a_pair_of_two_moments_is_no_basic_pair() -> None:

@@ -17,7 +17,7 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, metrics, ranges, strips, words
+from rille.pipeline.report import canvas, figures, gather, metrics, ranges, strips
 from rille.pipeline.report.delivery import lacking
 from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
@@ -343,7 +343,7 @@ def test_ground_limits_ignore_crowns() -> None:
 
 
 def test_spans() -> None:
-    assert words.spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+    assert quantities.spans([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
 
 
 def test_frames_without_truth_are_counted_where_errors_are_stated(tmp_path: Path) -> None:

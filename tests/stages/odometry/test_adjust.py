@@ -202,10 +202,9 @@ def test_a_chain_whose_errors_exceed_its_covariances_takes_them_times_a_factor()
 def test_factors_join_pieces_into_the_frame_of_the_first():
     truth, rng = ring(), np.random.default_rng(6)
     segments, before = run_of(truth, rng, lost={6})
-    assert before.meta["pieces"] == [[0, 5], [6, 11]]
+    assert before.meta["pieces"] == [list(range(6)), list(range(6, 12))]
     out = adjusted(segments, before, seen(truth, 0, 11, rng), seen(truth, 1, 10, rng))
-    assert out.meta["pieces"] == [[0, 11]]
-    assert out.meta["world"] == list(range(12))
+    assert out.meta["pieces"] == [list(range(12))]
     assert out.meta["verticals"] == ["attitude"]
     assert not out.meta["warnings"]
     e = errors(out, truth)[1:]
@@ -234,9 +233,8 @@ def test_a_piece_that_nothing_joins_stays_as_it_is():
     segments, before = run_of(truth, rng, lost={6, 12})
     assert len(before.meta["pieces"]) == 3
     out = adjusted(segments, before, seen(truth, 1, 14, rng), seen(truth, 2, 13, rng))
-    assert out.meta["pieces"] == [[0, 15], [6, 11]]
+    assert out.meta["pieces"] == [[0, 1, 2, 3, 4, 5, 12, 13, 14, 15], list(range(6, 12))]
     assert out.meta["main"] == 0
-    assert out.meta["world"] == [0, 1, 2, 3, 4, 5, 12, 13, 14, 15]
     for name in ("poses", "covariance"):
         np.testing.assert_array_equal(out[name][6:12], before[name][6:12])
 
@@ -271,7 +269,7 @@ def test_links_that_contradict_leave_other_pieces_joined():
     links = [seen(truth, a, b, rng) for a, b in ((1, 10), (2, 9), (8, 14), (9, 13))]
     links[-1]["pose"][3] += 0.15
     out = adjusted(segments, before, *links)
-    assert out.meta["pieces"] == [[0, 11], [12, 15]]
+    assert out.meta["pieces"] == [list(range(12)), [12, 13, 14, 15]]
     assert [line for line in out.meta["warnings"] if "not joined" in line]
     np.testing.assert_array_equal(out["poses"][12:], before["poses"][12:])
     here = slice(0, 12)

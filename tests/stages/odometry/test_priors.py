@@ -76,7 +76,7 @@ def test_a_sensor_joins_pieces_within_its_errors(sensor):
     segments, before = run_of(truth, rng, lost=set(range(12, 19)))
     assert len(before.meta["pieces"]) == 2
     out = adjusted(segments, before, sensor(truth, rng))
-    assert out.meta["pieces"] == [[0, 30]]
+    assert [(piece[0], piece[-1]) for piece in out.meta["pieces"]] == [(0, 30)]
     assert not [line for line in out.meta["warnings"] if line.startswith("[")]
     assert np.nanmax(np.linalg.norm(errors(out, truth)[:, :3], axis=1)) < 1.5
     assert 0.2 < nees(out, truth) < 3.0

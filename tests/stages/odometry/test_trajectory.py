@@ -139,7 +139,7 @@ def test_a_frame_lost_within_a_segment_is_bridged():
 def test_a_lost_key_frame_breaks_the_trajectory_into_named_pieces():
     truth, levels, out = broken_run({3})
     assert out["piece"].tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
-    assert out.meta["pieces"] == [[0, 2], [3, 7]]
+    assert out.meta["pieces"] == [[0, 1, 2], [3, 4, 5, 6, 7]]
     assert out.meta["main"] == 1
     assert [fact for fact in ("0-2", "3-7") if fact not in out.meta["warnings"][-1]] == []
     T = levels[1] @ truth[3].inverse()
@@ -150,7 +150,7 @@ def test_a_lost_key_frame_breaks_the_trajectory_into_named_pieces():
 def test_a_frame_that_is_a_piece_alone_is_lost():
     _, _, out = broken_run({1, 2, 3, 7})
     assert out["piece"].tolist() == [-1, -1, -1, 0, 0, 0, 0, -1]
-    assert out.meta["pieces"] == [[3, 6]]
+    assert out.meta["pieces"] == [[3, 4, 5, 6]]
     assert [f["frame"] for f in out.meta["lost"]] == [0, 1, 2, 7]
     assert all(f["bridged"] is None for f in out.meta["lost"])
     _, _, nothing = broken_run({1, 2, 3, 4, 5, 6, 7})
