@@ -52,8 +52,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
     from rille.pipeline.engine.graph import Graph
     from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.flow.builders import merge_tiles
-    from rille.pipeline.flow.reconstruction import TILE_CELLS
+    from rille.pipeline.flow.world import TILE_CELLS, merge_tiles
     from rille.stages.terrain.merge import MergeParams, merge_stage
     from rille.stages.terrain.tile_index import tile_index_stage
 
@@ -83,7 +82,7 @@ def merged(cache: Path, where: list[tuple[int, int]], cells: int, jobs: int, led
 
 def tiles_of(cells: int, at: tuple[int, int], cache: Path) -> set[str]:
     """Labels of the tiles that a model's cells touch, cell by cell."""
-    from rille.pipeline.flow.reconstruction import TILE_CELLS
+    from rille.pipeline.flow.world import TILE_CELLS
 
     z = synthetic_dem(NoParams(), pair=0, i0=at[0], j0=-at[1], cells=cells)["elevation"]
     rows, cols = np.nonzero(np.isfinite(z))

@@ -149,7 +149,7 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
     if name == "trajectory":
         frames = args["frames"]
         positions = [[0.0, SPACING * k, 0.0] for k in range(len(frames))]
-        return {"frames": frames, "positions": positions, "pieces": [[frames[0], frames[-1]]], "main": 0}
+        return {"frames": frames, "positions": positions, "pieces": [frames], "main": 0}
     if name == "locus":
         from rille.stages.geometry.lattice import Lattice
 

@@ -52,7 +52,7 @@ FACTS: dict[str, dict[str, Any]] = {
     },
     "locus": {"lattice": LATTICE},
     "frame_screening": {"asks": {"bridges": [], "sides": []}, "chain": list(FRAMES), "unfit": [], "lost": []},
-    "trajectory": {**POSITIONS, "pieces": [[0, 4]], "main": 0},
+    "trajectory": {**POSITIONS, "pieces": [list(range(5))], "main": 0},
     "crosscheck_join": {"frames": list(FRAMES), "pieces": [list(FRAMES)], "main": 0},
     "intrinsics": {"correction": []},
     "moving": {"share": 0.0},

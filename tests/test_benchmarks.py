@@ -189,7 +189,7 @@ def test_gaps_error_and_sigma_are_those_of_the_gap_alone() -> None:
     covariance = np.zeros((4, 6, 6))
     covariance[:, 2, 2] = [0.0, 0.01, 0.02, 0.06]
     arrays = {"poses": line([7.0, 8.0, NONE, 10.5]), "covariance": covariance, "piece": np.array([0, 0, -1, 0])}
-    row = gaps.judge(Bundle(arrays, {"pieces": [[1, 4]]}), line(np.arange(6.0)), 2, 4, 1)
+    row = gaps.judge(Bundle(arrays, {"pieces": [[1, 2, 3, 4]]}), line(np.arange(6.0)), 2, 4, 1)
     assert (row["error"], row["sigma"]) == pytest.approx((0.5, np.sqrt(0.05)))
 
 

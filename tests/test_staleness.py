@@ -176,7 +176,9 @@ def edited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         cached.cache_clear()
 
 
-EDITED = sorted(set().union(*(reached(stage.module) for stage in configuration.stages("reconstruction").values())))
+EDITED = sorted(
+    set().union(*(reached(stage.module) for stage in configuration.stages(*configuration.RECONSTRUCTION).values()))
+)
 
 
 @pytest.mark.parametrize("module", EDITED[::16])

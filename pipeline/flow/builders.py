@@ -24,7 +24,7 @@ from rille.stages.core.errors import ConfigError
 from rille.stages.facts.calibration import CalibrationFacts, OrientationFacts, RigFacts, SwapFacts, SynchronyFacts
 from rille.stages.facts.imaging import PyramidFacts, QualityFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts, ResectFacts, TrackFacts, TrajectoryFacts
-from rille.stages.facts.terrain import DemFacts, GroundFacts, MergeFacts, TileIndexFacts
+from rille.stages.facts.terrain import DemFacts, GroundFacts
 from rille.stages.geometry.geometry import Camera
 from rille.stages.hazard.risk import risk_stage
 from rille.stages.hfvm.stage import hfvm_stage
@@ -39,9 +39,7 @@ from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
 from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage
 from rille.stages.terrain.locus.stage import locus_stage
-from rille.stages.terrain.merge import merge_stage
 from rille.stages.terrain.reference import judge
-from rille.stages.terrain.tile_index import Box, tile_lattice
 
 Args = Mapping[str, Any]
 P = ParamSpec("P")
@@ -392,50 +390,3 @@ def other_plane(config: Any, levels: Series[Any], *, placed: bool) -> Args | Non
     if wanted == "ground":
         return None
     return {"reference": list(wanted) if isinstance(wanted, tuple) else SCENE}
-
-
-def merge_tiles(
-    node: Callable[..., Handle[Any]],
-    footprints: Series[TileIndexFacts],
-    dems: Mapping[int, Handle[DemFacts]],
-    steps: Mapping[str, int],
-    inverse_depth_std: float | None = None,
-) -> list[Handle[MergeFacts]]:
-    """Add one task for each world tile that a model touches; it reads these models and nothing else.
-
-    Parameters
-    ----------
-    node : adds a task, as :meth:`Builder.node` does.
-    footprints : facts of stage ``tile_index``, one a model.
-    dems : world models by pair.
-    steps : exposure of the pairs whose grey values are levelled, as stage ``radiometry`` gives them.
-    inverse_depth_std : of a rig that was repaired, as stage ``intrinsics`` gives it.
-    """
-    touching: dict[tuple[int, int], list[tuple[int, Box]]] = {}
-    for meta in footprints:
-        for tx, ty, *box in meta["tiles"]:
-            touching.setdefault((ty, tx), []).append((meta["pair"], (box[0], box[1], box[2], box[3])))
-    merged: list[Handle[MergeFacts]] = []
-    for (ty, tx), here in sorted(touching.items()):
-        # In order of the pairs: merging must not depend on the order in which results arrived.
-        here.sort()
-        lattice = tile_lattice([box for _, box in here], footprints[0]["cell"]).to_dict()
-        # Of this tile's pairs alone: a level that changes elsewhere leaves the tile in the cache.
-        exposure = {str(pair): steps[str(pair)] for pair, _ in here if str(pair) in steps}
-        merged.append(
-            node(
-                merge_stage,
-                f"merge/{tx}_{ty}",
-                dems=[dems[pair] for pair, _ in here],
-                lattice=lattice,
-                exposure=exposure or None,
-                inverse_depth_std=inverse_depth_std,
-            )
-        )
-    return merged
-
-
-def centre(box: Mapping[str, Any]) -> list[float]:
-    """Centre x, y of a lattice, metres."""
-    half = 0.5 * box["cell"]
-    return [box["x0"] + half * (box["cols"] - 1), box["y0"] - half * (box["rows"] - 1)]

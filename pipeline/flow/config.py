@@ -72,14 +72,19 @@ DATASET_SECTIONS = ("mockup", "misalign", "rover")
 """Sections that belong to a kind of sequence; the sequence validates them."""
 
 
+RECONSTRUCTION = ("builders", "reconstruction", "selection", "world", "assessment")
+DRIVE = ("builders", "closed_loop")
+"""Modules of this folder that lay out the tasks of each kind of run."""
+
+
 @cache
 def stages(*flows: str) -> dict[str, Stage]:
-    """The stages that the flows import (all flows by default), by name.
+    """The stages that modules of flows import (all by default), by name.
 
     Each stage with parameters has a section.
     """
-    every = "builders", "reconstruction", "closed_loop", "assessment"
-    found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or every]
+    every = {*RECONSTRUCTION, *DRIVE}
+    found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or sorted(every)]
     used = [value for values in found for value in values]
     listed = [v if isinstance(v, Stage) else declared(v) for v in used if isinstance(v, Stage | ModuleType)]
     return {stage.name: stage for stage in listed if stage is not None}

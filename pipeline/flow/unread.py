@@ -19,7 +19,7 @@ from operator import attrgetter
 from typing import Any
 
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.flow.config import stages
+from rille.pipeline.flow.config import DRIVE, RECONSTRUCTION, stages
 from rille.stages.core.declare import Params
 from rille.stages.core.errors import ConfigError
 
@@ -30,8 +30,8 @@ CHECKED = frozenset(("undistort", "pyramid", "motion", "hfvm", "tiling", "orient
 @cache
 def foreign(*, driven: bool) -> frozenset[str]:
     """Sections that only the other kind of run has: of a drive those of a reconstruction, and the other way round."""
-    drives = {"drive", *stages("builders", "closed_loop")} - {"undistort"}
-    reconstructions = {*stages("builders", "reconstruction", "assessment")}
+    drives = {"drive", *stages(*DRIVE)} - {"undistort"}
+    reconstructions = {*stages(*RECONSTRUCTION)}
     return frozenset(reconstructions - drives if driven else drives - reconstructions)
 
 

@@ -11,9 +11,6 @@ from rille.pipeline.flow import config
 from rille.pipeline.runs.lookup import refuse_unknown
 from rille.stages.core.errors import ConfigError
 
-FLOWS = ("builders", "reconstruction", "assessment")
-"""Modules that lay out the stages of a reconstruction."""
-
 MADE_BY = {
     "crosscheck_accuracy": "accuracy",
     "local_dem_accuracy": "dem_accuracy",
@@ -39,7 +36,7 @@ def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
     """
     if until and only:
         raise ConfigError("RIL-034", "--until and --only are both given", remedy="give one of them")
-    stages = set(config.stages(*FLOWS))
+    stages = set(config.stages(*config.RECONSTRUCTION))
     refuse_unknown("--until", until, stages, "stage")
     files = {output.name: output for output in catalogue.OUTPUTS}
     refuse_unknown("--only", only, files, "file")

@@ -23,7 +23,7 @@ FACTS: dict[str, dict[str, Any]] = {
     "keyframes": {"basic": [0, 2], "segments": [[0, 1, 2]], "displacement": [1.0, 1.0], "match_rate": [1.0, 1.0]},
     "intrinsics": {"correction": []},
     "moving": {"share": 0.0},
-    "trajectory": {"pieces": [[0, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
+    "trajectory": {"pieces": [[0, 1, 2]], "main": 0, "frames": [0, 1, 2], "positions": [[0, k, 0] for k in range(3)]},
     "radiometry": {"steps": {}},
     "tile_index": {"tiles": [(0, 0, 0, 0, 4, 4)], "box": BOX, "cell": 0.01},
     "ground_frame": {"T_local_left": HERE, "plane": [0.0, 0.0, -1.0], "source": "attitude"} | SEEN,

@@ -13,7 +13,7 @@ from rille.pipeline.engine import events
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.flow.builders import merge_tiles
+from rille.pipeline.flow.world import merge_tiles
 from rille.stages.core.declare import NoParams
 from rille.stages.terrain.merge import MergeParams, merge_stage
 from rille.stages.terrain.tile_index import tile_index_stage

@@ -25,7 +25,8 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name_graph
-from rille.pipeline.flow.reconstruction import spread, vertical
+from rille.pipeline.flow.reconstruction import vertical
+from rille.pipeline.flow.selection import spread
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder

@@ -15,7 +15,8 @@ from rille.pipeline.flow import config
 from rille.pipeline.flow.builders import PYRAMID_BYTES, Builder, other_plane
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.flow.products import Products
-from rille.pipeline.flow.reconstruction import cells_in_both, overlaps, spread
+from rille.pipeline.flow.selection import spread
+from rille.pipeline.flow.world import cells_in_both, overlaps
 from rille.stages.geometry.lens import Lens
 from rille.stages.terrain.ground_frame import SCENE
 from rille.stages.terrain.tile_index import Box

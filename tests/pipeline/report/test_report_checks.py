@@ -73,7 +73,7 @@ def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(s
     for k, pose in enumerate(poses):
         pose[:, :3], pose[2, 3] = rotation_exp([0.0, k * turn, 0.0]), pose[2, 3] + k * step
     covariance = np.tile(1e-8 * np.eye(6), (5, 1, 1))
-    meta = {"frames": list(range(5)), "pieces": [[0, 4]], "main": 0}
+    meta = {"frames": list(range(5)), "pieces": [list(range(5))], "main": 0}
     arrays = {"poses": poses, "covariance": covariance, "piece": np.zeros(5, np.int16)}
     lines = summary._resting(Bundle(arrays, meta))
     assert len(lines) == told
@@ -214,7 +214,7 @@ def in_pieces(piece: list[int], main: int) -> dict[str, Bundle]:
     made = bundles() | checks()
     trajectory = made["trajectory"]
     rows = [np.flatnonzero(np.array(piece) == k) for k in range(max(piece) + 1)]
-    facts = {"pieces": [[int(r[0]), int(r[-1])] for r in rows], "main": main, "verticals": ["attitude"] * len(rows)}
+    facts = {"pieces": [r.tolist() for r in rows], "main": main, "verticals": ["attitude"] * len(rows)}
     made["trajectory"] = Bundle(trajectory.arrays | {"piece": np.array(piece, dtype=np.int16)}, trajectory.meta | facts)
     return made
 

@@ -33,7 +33,9 @@ def part(chain: Chain, until: tuple[str, ...] = (), only: tuple[str, ...] = ()) 
 
 
 def test_of_each_stage_a_part_has_all_tasks_and_all_that_they_read(chain: Chain) -> None:
-    for stage in {h.stage for h in chain.base.nodes} & set(part_of_run.config.stages(*part_of_run.FLOWS)):
+    for stage in {h.stage for h in chain.base.nodes} & set(
+        part_of_run.config.stages(*part_of_run.config.RECONSTRUCTION)
+    ):
         graph, _ = part(chain, (stage,))
         have = {h.label: h for h in graph.nodes}
         assert {h.label for h in chain.base.nodes if h.stage == stage} <= have.keys(), stage

@@ -111,7 +111,7 @@ def bundles() -> dict[str, Bundle]:
                 "segment": np.array([0, 0, 0, 0, 0, 1], dtype=np.int16),
                 "piece": np.zeros(6, dtype=np.int16),
             },
-            {"frames": list(FRAMES), "pieces": [[0, 5]], "main": 0, "verticals": ["attitude"]},
+            {"frames": list(FRAMES), "pieces": [list(FRAMES)], "main": 0, "verticals": ["attitude"]},
         ),
     }
     error = np.where(np.isfinite(z), 4e-4, np.nan).astype(np.float32)
