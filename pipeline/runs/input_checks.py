@@ -57,10 +57,8 @@ class Fault(Limit):
 
 
 LIMITS = (
-    Fault("RIL-640", "baselines to the left", "rig", most=0.5, remedy="swap left and right"),  # of the right camera
     # Outside of these limits another unit of length is likelier than such a rig.
     Limit("RIL-641", "baseline, m", "rig", least=0.01, most=5.0, remedy="is the baseline in metres?"),
-    Limit("RIL-642", "ratio of the focal lengths", "rig", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
     Fault("RIL-643", "steps back", "times", most=0, remedy="correct the times"),
     Limit("RIL-644", "gaps", "times", most=0, remedy="are frames missing there, or was the clock set forward?"),
     Limit("RIL-645", "without", "truth", most=0, remedy="frames without truth are left out of the accuracy"),
@@ -118,8 +116,8 @@ LIMITS = (
         "sides",
         most=0.5,
         remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
-        "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
-        "angle between the cameras is off",
+        "baseline has the wrong sign, its transformation leads from right to left, or the scene repeats (bricks, "
+        "tiles); or all of it is far (sky), and an angle between the cameras is off",
     ),
     Limit("RIL-660", "beyond", "sides", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     Limit("RIL-773", "unlike", "sides", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
@@ -195,7 +193,8 @@ def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -
 
 
 def judge_rig(rig: Rig) -> Finding:
-    """Baseline, sides and focal lengths of the calibration."""
+    """Baseline, sides and focal lengths of the calibration; whether sides and lenses are those of the images, matches
+    show."""
     left, right, b, x = rig.left, rig.right, rig.baseline, -float(rig.centre[0])
     # In pixels and in image widths: equal lenses with sensors of unlike pixels, or of unlike width, are no mistake.
     ratios = right.fx / left.fx, right.fx / left.fx * left.width / right.width
@@ -204,8 +203,7 @@ def judge_rig(rig: Rig) -> Finding:
     if (right.width, right.height) != (left.width, left.height) or unlike > MAX_ALIKE_SCALE:
         words += f", right {right.fx:g} px, {right.width} x {right.height}"
     words += f"; the right camera stands {x:g} m to the left" if x > 0 else ""
-    figures = {"baselines to the left": x / b, "baseline, m": b, "ratio of the focal lengths": unlike}
-    return judge("rig", words, figures)
+    return judge("rig", words, {"baseline, m": b})
 
 
 # -- records of the chosen frames of a sequence ----------------------------------------------------------------------

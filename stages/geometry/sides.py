@@ -70,8 +70,9 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
         raise DegenerateError(
             "RIL-781",
             f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, the sign of the baseline, whether the images are "
-            "mirrored or upside down, and whether the scene repeats along the rows (bricks, tiles)",
+            remedy="check left/right order, they seem swapped, the sign of the baseline, whether its transformation "
+            "leads from right to left, whether the images are mirrored or upside down, and whether the scene repeats "
+            "along the rows (bricks, tiles)",
         )
     if beyond > 0.5:
         raise BeyondInfinityError(
