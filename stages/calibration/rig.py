@@ -48,7 +48,8 @@ from rille.stages.geometry.epipolar import (
     corrected,
     distances,
     image_turn,
-    standing,
+    standing_right,
+    turn_axes,
 )
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
@@ -223,11 +224,13 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
     # The offset stands for the angle that causes it, which is not repeated.
-    if standing(rig):
+    if standing_right(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:
         lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"
     parts = [f"{lines} of the right image lie {abs(offset):.2f} px too {where}"]
+    if turn_axes(rig)[0, 1]:  # rows and columns are crossed alike
+        parts, told = [f"the right image lies {abs(offset):.2f} px off the epipolar lines"], ""
     for p in decision.parameters:
         degrees = math.degrees(p.value)
         # Positive roll turns x (right) to y (down): clockwise in the image.

@@ -97,9 +97,9 @@ def corrected_rig(
 ) -> Rig:
     """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
 
-    Where one camera stands above the other, pitch and yaw change places.
+    Where a pitch moves all disparities, as of cameras one above the other, pitch and yaw change places.
     """
-    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
+    first = [yaw, pitch] if epipolar.standing_right(rig) else [pitch, yaw]
     turned = epipolar.corrected(rig, np.array([*first, *others]))
     return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
 

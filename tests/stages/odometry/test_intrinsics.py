@@ -203,10 +203,20 @@ def test_poses_are_corrected_for_a_toe_in_that_a_straight_drive_shows(angle, cen
 
 
 @pytest.mark.parametrize("yaw", [0.003, -0.006])
-@pytest.mark.parametrize(("centre", "name"), [((-0.12, 0.0, 0.0), "yaw"), ((0.01, -0.12, 0.0), "pitch")])
-def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, name):
-    """Of cameras one above the other, it is the pitch that moves all disparities."""
-    off, before, base = yaw, 0.0, RigidTransform(np.eye(3), np.array(centre))
+@pytest.mark.parametrize(
+    ("centre", "roll", "name"),
+    [
+        ((-0.12, 0.0, 0.0), 0.0, "yaw"),
+        ((0.01, -0.12, 0.0), 0.0, "pitch"),
+        ((-0.12, 0.0, 0.0), -1.5, "pitch"),
+        ((-0.08, 0.09, 0.0), 0.0, "pitch"),
+        ((-0.12, 0.0, 0.0), -0.6, "yaw"),
+    ],
+)
+def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, roll, name):
+    """Of cameras one above the other, or one on its side, it is the pitch that moves all disparities."""
+    turned = rotation_exp([0.0, 0.0, roll])
+    off, before, base = yaw, 0.0, RigidTransform(turned, turned @ np.array(centre))
     for _ in range(4):
         facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=off, base=base, before=[0.0, 0.0, 0.0, before])
         assert facts["correction"][:CORRECTED] == [0.0] * CORRECTED
