@@ -244,6 +244,19 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
         last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
         return [move.warning for move in _drift([*start[:-1], last], rows, RigParams())]
 
+    def scattered(shares):
+        by = np.outer(shares, away)
+        rows = [
+            {"pair": k, "values": dict(zip(NAMES, row, strict=True)), "sigma": dict.fromkeys(NAMES, 1e-3)}
+            for k, row in enumerate(np.degrees(by))
+        ]
+        shown = [
+            replace(one, constant=one.constant - one.design[:, :RIG] @ row) for one, row in zip(start, by, strict=False)
+        ]
+        return [move.warning for move in _drift(shown, rows, RigParams())]
+
+    # No pair has the usual value of each parameter.
+    assert scattered([1.0, 0.7, -0.9, -0.6]) == []
     alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
     assert told(away, shown=True) == []
     assert told(alone, shown=False) == []  # what the pair's own values claim and its rows do not show
