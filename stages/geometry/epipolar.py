@@ -42,15 +42,15 @@ def turn_axes(rig: Rig) -> Floats:
     """Axes of pitch, yaw and roll in the right camera's frame, the columns of (3, 3).
 
     They are those of the camera, unless its image shows the baseline obliquely: there a pitch and a yaw would move it
-    across and along its epipolar lines alike, and no row would tell the two apart. One axis lies along the baseline.
+    across and along its epipolar lines alike, and no row would tell the two apart. There that of pitch lies along it.
     """
     x, y, _ = rig.T_right_left.translation
-    angle = math.atan2(y, x)
-    oblique = angle - 0.5 * math.pi * round(2.0 * angle / math.pi)
+    angle = math.remainder(math.atan2(y, x), math.pi)
+    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(MAX_OBLIQUE_DEG)
     # 0.5: of the baseline. Where it leads along the view, lines radiate and show all turns.
-    if abs(oblique) <= math.radians(MAX_OBLIQUE_DEG) or math.hypot(x, y) < 0.5 * rig.baseline:
+    if not oblique or math.hypot(x, y) < 0.5 * rig.baseline:
         return np.eye(3)
-    return rotation_exp([0.0, 0.0, oblique])
+    return rotation_exp([0.0, 0.0, angle])
 
 
 def standing_right(rig: Rig) -> bool:

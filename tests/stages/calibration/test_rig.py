@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from fnmatch import fnmatch
 
 import numpy as np
 import pytest
@@ -131,13 +132,25 @@ def test_a_yaw_that_the_tracks_have_corrected_is_not_said_to_be_held():
     assert not any("yaw" in line for line in found["warnings"])
 
 
-def test_words_of_a_knock_where_one_camera_stands_above_the_other():
-    rig = street_rig()
-    standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))
-    pairs = [matches(knocked(standing, yaw_deg=0.24, roll_deg=0.3), street_depth, pair=k) for k in range(2)]
-    line = facts(standing, pairs)["warnings"][0]
-    assert "columns of the right image lie 3." in line
-    assert " px too far right, it is turned by 0.30 degrees clockwise" in line
+@pytest.mark.parametrize(
+    ("centre", "roll", "angle", "words"),
+    [
+        ((0.0, 0.5, 0.0), 0.0, "yaw", "columns of the right image lie 3.* px too far right, it is"),
+        ((0.5, 0.0, 0.0), 90.0, "yaw", "columns of the right image lie 3.* px too far right, it is"),
+        (
+            (0.35, 0.35, 0.0),
+            0.0,
+            "pitch",
+            "the right image lies 3.* px off the epipolar lines, pitch is off by *, it is",
+        ),
+    ],
+)
+def test_words_of_a_knock_where_epipolar_lines_are_no_rows(centre, roll, angle, words):
+    camera, rotation = street_rig().left, rotation_exp([0.0, 0.0, np.radians(roll)])
+    rig = Rig(camera, camera, RigidTransform(rotation, -rotation @ np.array(centre)))
+    true = knocked(rig, roll_deg=0.3, **{f"{angle}_deg": 0.24})
+    line = facts(rig, [matches(true, street_depth, pair=k) for k in range(2)])["warnings"][0]
+    assert fnmatch(line, f"*: {words} turned by 0.30 degrees clockwise*")
 
 
 def test_mode_fixed_only_tells():

@@ -100,8 +100,7 @@ def test_correction_keeps_the_baseline_and_is_what_distances_mean(c):
             (rolled_rig(roll), name)
             for roll, name in ((90.0, "pitch"), (-90.0, "pitch"), (180.0, "yaw"), (30.0, "yaw"))
         ],
-        (rolled_rig(60.0), "pitch"),
-        (rolled_rig(0.0, (0.3, -0.35, 0.0)), "pitch"),
+        *[(rolled_rig(roll), "yaw") for roll in (44.0, 46.0, 60.0, 134.0, -46.0)],
         (rolled_rig(90.0, (0.01, 0.5, 0.0)), "yaw"),
     ],
 )

@@ -209,7 +209,7 @@ def test_poses_are_corrected_for_a_toe_in_that_a_straight_drive_shows(angle, cen
         ((-0.12, 0.0, 0.0), 0.0, "yaw"),
         ((0.01, -0.12, 0.0), 0.0, "pitch"),
         ((-0.12, 0.0, 0.0), -1.5, "pitch"),
-        ((-0.08, 0.09, 0.0), 0.0, "pitch"),
+        ((-0.08, 0.09, 0.0), 0.0, "yaw"),
         ((-0.12, 0.0, 0.0), -0.6, "yaw"),
     ],
 )
