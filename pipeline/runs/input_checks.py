@@ -74,8 +74,6 @@ LIMITS = (
     Limit("RIL-990", "rows", "positions", least=3, remedy="is time_offset right, and the clock the images'?"),
     Limit("RIL-991", "lengths over sigma", "positions", least=1.0, remedy="they say nothing of so short a way"),
     Limit("RIL-648", "known", "up", least=1, remedy="the ground is levelled by its own plane"),
-    # y points down in camera frames: up has a negative y in an upright camera.
-    Limit("RIL-649", "y in the images", "up", most=0.0, remedy="held upside down, or a wrong sign?"),
     Limit("RIL-650", "blank", "images", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
     Limit("RIL-668", "lost", "images", most=0, remedy="it gets no pose; its neighbours are joined across it"),
     Fault("RIL-670", "unusable", "images", most=0, remedy="mend, convert or remove what is wrong"),
@@ -292,13 +290,13 @@ def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
 
 
 def judge_up(of: Sequence, frames: Frames) -> Finding | None:
-    """Whether the stated vertical is plausible."""
+    """Whether the vertical is stated; ground above the cameras shows that it has the wrong sign."""
     if of.up is None:
         return None
     known = [v for v in (of.up[k] for k in frames) if v is not None]
     y = float(np.mean([v[1] for v in known])) if known else 0.0
     words = f"known of {len(known)} of {len(frames)} frames" + ("; it points down in the images" if y > 0 else "")
-    return judge("up", words, {"known": len(known), "y in the images": y})
+    return judge("up", words, {"known": len(known)})
 
 
 RECORDS = (judge_times, judge_truth, judge_odometry, judge_positions, judge_attitude, judge_up)

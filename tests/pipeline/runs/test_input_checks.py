@@ -140,10 +140,11 @@ def test_positions_are_counted_within_the_time_of_the_images(change, level, word
     assert input_checks.judge_positions(*recorded(3)) is None
 
 
-def test_up_points_up():
+def test_up_is_stated():
     assert input_checks.judge_up(*recorded(1)) is None
     assert input_checks.judge_up(*recorded(1, up=[(0.0, -1.0, 0.0)])).level == "OK"
-    assert input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)])).level == "WARN"
+    turned = input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)]))  # of a camera that is mounted upside down
+    assert (turned.level, turned.text.split("; ")[1]) == ("OK", "it points down in the images")
     assert input_checks.judge_up(*recorded(1, up=[None])).level == "WARN"
 
 

@@ -293,6 +293,18 @@ def test_swapped_images_are_named():
         facts(street_rig(), pairs)
 
 
+@pytest.mark.parametrize("centre", [(0.54, 0.0, 0.0), (-0.54, 0.0, 0.0), (0.0, 0.54, 0.0), (0.4, 0.0, 0.4)])
+def test_an_inverted_transformation_is_named_and_cameras_in_any_order_are_not(centre):
+    """Whose principal points are not alike, so that exchanged sides do not explain the matches."""
+    camera = street_rig().left
+    right = replace(camera, cx=camera.cx - 12.0, cy=camera.cy + 12.0)
+    rig = Rig(camera, right, RigidTransform(np.eye(3), np.negative(centre)))
+    pairs = [matches(rig, street_depth, pair=k, samples=800) for k in range(2)]
+    assert facts(rig, pairs)["warnings"] == []
+    with raises("RIL-781", "its transformation inverted"):
+        facts(replace(rig, T_right_left=rig.T_right_left.inverse()), pairs)
+
+
 @pytest.mark.parametrize("off", [-2.5, -9.0])
 def test_a_sky_through_a_camera_that_is_turned_is_not_called_swapped(off):
     rng = np.random.default_rng(2)
