@@ -49,7 +49,7 @@ def rig_of(
     ------
     InputError
         The image size or the relative pose is unknown, the images have another size than the calibration's, a focal
-        length is impossible, or the cameras stand in one place, or are swapped.
+        length is impossible, or the cameras stand in one place.
     """
     of_left, of_right = sizes or (None, None)
     if sizes is not None:
@@ -66,14 +66,6 @@ def rig_of(
     if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
         raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
-    to_the_right = float(rig.centre[0])
-    # A rig with a mainly vertical baseline has no sides.
-    if to_the_right < -0.5 * rig.baseline:
-        place = f"stands {-to_the_right:.4g} m to the left of the left camera {left.name}"
-        text = f"swapped cameras: the right camera {right.name} {place}"
-        remedy = "invert the transformation if it leads from right to left; else exchange left and right"
-        more = "of the images too if they are swapped as well or show all upside down"
-        raise InputError("RIL-130", text, remedy=f"{remedy}, {more}")
     distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
     return rig, distorted or None
 

@@ -34,7 +34,7 @@ from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
 from rille.stages.odometry.pose import pose_stage
-from rille.stages.odometry.resection.calibration_errors import calibrated_anew, corrected
+from rille.stages.odometry.resection.calibration_errors import calibrated_anew, corrected, errors_of
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
 from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage
@@ -98,12 +98,11 @@ def name_graph(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
 
 def recalibrated(sequence: Sequence, correction: Series[float]) -> Sequence:
     """The sequence with its cameras and its rig's yaw corrected as stage ``intrinsics`` says."""
-    lenses = (sequence.lenses or {}).items()
-    return replace(
-        sequence,
-        rig=calibrated_anew(sequence.rig, correction),
-        lenses={side: replace(lens, camera=corrected(lens.camera, correction)) for side, lens in lenses} or None,
-    )
+    rig, lenses = sequence.rig, (sequence.lenses or {}).items()
+    anew = {
+        side: replace(lens, camera=corrected(lens.camera, errors_of(side, rig, correction))) for side, lens in lenses
+    }
+    return replace(sequence, rig=calibrated_anew(rig, correction), lenses=anew or None)
 
 
 class Builder:

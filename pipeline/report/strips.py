@@ -21,8 +21,10 @@ from rille.pipeline.report import canvas, gather, ranges
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import Bundle
 from rille.stages.core.quantities import metres
 from rille.stages.core.validity import matched
+from rille.stages.geometry.epipolar import inverse_depth
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import grey_bytes
 
@@ -60,14 +62,6 @@ def drive(scene: Scene) -> Block | None:
     return Block(_fitting(stops, lambda stop, width: _stop(scene, stop, width)), legend)
 
 
-def depth_band(rig: Rig) -> tuple[str, int]:
-    """Component of the disparity along the baseline, and the sign by which it is the smaller the nearer a point is."""
-    right, below, _ = rig.centre
-    # Right minus left: a camera to the right (or below) sees what is near farther to the left (or above).
-    band, along = ("column_disparity", right) if abs(right) >= abs(below) else ("row_disparity", below)
-    return band, 1 if along >= 0 else -1
-
-
 def risk_picture(risk: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:
     """Classes of a risk map in their colours, and lines on them; ``width`` in pixels."""
     picture = Image.fromarray(canvas.paint(risk.arrays["risk"], *canvas.RISK)).convert("RGBA")
@@ -97,13 +91,12 @@ def _fitting(items: Sequence[Any], draw: Callable[[Any, int], Panel]) -> tuple[P
 def _pair(scene: Scene, pair: int, width: int) -> Panel:
     view = scene.view
     bundle, image = artifact(view, view.products.disparity[pair]), view.bundle(view.products.images.get(pair))
-    band, sign = depth_band(view.sequence.rig)
     there = matched(np.asarray(bundle["validity"]))
     seen = np.full(there.shape, 96, np.uint8) if image is None else grey_bytes(np.asarray(image["image"]))
     photo = _photo(seen, width)
     pictures, words = [photo], [f"{there.mean():.0%} matched"]
     if seen.shape[:2] == there.shape:
-        pictures.append(_matches(photo, sign * np.asarray(bundle[band]), there))
+        pictures.append(matches_picture(photo, bundle, view.sequence.rig))
     dem = gather.terrain(view.bundle(view.products.local_dem.get(pair)), "elevation")
     if dem is not None:
         pictures.append(_elevations(dem, (), width))
@@ -157,17 +150,24 @@ def _scaled(picture: Image.Image, width: int) -> Image.Image:
     return picture.resize(size, Image.Resampling.BOX if factor < 1 else Image.Resampling.NEAREST)
 
 
-def _matches(photo: Image.Image, disparity: Floats, there: NDArray[np.bool_]) -> Image.Image:
-    """Disparities (row, col) in colour on the image; pixels that were not matched stay grey."""
-    low, high = ranges.limits(np.where(there, disparity, np.nan))
+def matches_picture(photo: Image.Image, disparity: Bundle, rig: Rig) -> Image.Image:
+    """Inverse depths of a pair in colour on its left image, blue far; pixels that were not matched stay grey.
+
+    Disparities show depth by their change along the epipolar lines alone, which run as the cameras stand.
+    """
+    validity = np.asarray(disparity["validity"])
     # The pixel in the middle of each of the small picture's.
-    at = np.ix_(
-        *(((np.arange(n) + 0.5) * of / n).astype(int) for n, of in zip(photo.size[::-1], there.shape, strict=True))
+    rows_cols = (
+        ((np.arange(n) + 0.5) * of / n).astype(int) for n, of in zip(photo.size[::-1], validity.shape, strict=True)
     )
-    # The smaller the nearer a point is: turned round, so that blue is far.
-    colors, ground = _colors((high - disparity[at]) / max(high - low, 1e-9)), np.asarray(photo.convert("RGB"))
+    at = np.ix_(*rows_cols)
+    there, pixels = matched(validity[at]), np.stack(np.meshgrid(*map(np.ravel, at[::-1])), -1).reshape(-1, 2)
+    shift = np.stack([np.asarray(disparity[f"{name}_disparity"])[at].ravel() for name in ("column", "row")], -1)
+    near = inverse_depth(rig, pixels.astype(np.float64), shift)[0].reshape(there.shape)
+    low, high = ranges.limits(np.where(there, near, np.nan))
+    colors, ground = _colors((near - low) / max(high - low, 1e-9)), np.asarray(photo.convert("RGB"))
     # Divided before multiplied: bytes would overflow the other way round.
-    return Image.fromarray(np.where(there[at][..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
+    return Image.fromarray(np.where(there[..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
 
 
 def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:

@@ -57,10 +57,8 @@ class Fault(Limit):
 
 
 LIMITS = (
-    Fault("RIL-640", "baselines to the left", "rig", most=0.5, remedy="swap left and right"),  # of the right camera
     # Outside of these limits another unit of length is likelier than such a rig.
     Limit("RIL-641", "baseline, m", "rig", least=0.01, most=5.0, remedy="is the baseline in metres?"),
-    Limit("RIL-642", "ratio of the focal lengths", "rig", most=MAX_ALIKE_SCALE, remedy="two different lenses?"),
     Fault("RIL-643", "steps back", "times", most=0, remedy="correct the times"),
     Limit("RIL-644", "gaps", "times", most=0, remedy="are frames missing there, or was the clock set forward?"),
     Limit("RIL-645", "without", "truth", most=0, remedy="frames without truth are left out of the accuracy"),
@@ -76,8 +74,6 @@ LIMITS = (
     Limit("RIL-990", "rows", "positions", least=3, remedy="is time_offset right, and the clock the images'?"),
     Limit("RIL-991", "lengths over sigma", "positions", least=1.0, remedy="they say nothing of so short a way"),
     Limit("RIL-648", "known", "up", least=1, remedy="the ground is levelled by its own plane"),
-    # y points down in camera frames: up has a negative y in an upright camera.
-    Limit("RIL-649", "y in the images", "up", most=0.0, remedy="held upside down, or a wrong sign?"),
     Limit("RIL-650", "blank", "images", most=0, remedy="left ones get no pose, right ones no depth: take them anew"),
     Limit("RIL-668", "lost", "images", most=0, remedy="it gets no pose; its neighbours are joined across it"),
     Fault("RIL-670", "unusable", "images", most=0, remedy="mend, convert or remove what is wrong"),
@@ -118,8 +114,8 @@ LIMITS = (
         "sides",
         most=0.5,
         remedy="left and right, or their calibrations, are swapped, the images are mirrored or upside down, the "
-        "baseline has the wrong sign, or the scene repeats (bricks, tiles); or all of it is far (sky), and an "
-        "angle between the cameras is off",
+        "baseline has the wrong sign, its transformation leads from right to left, or the scene repeats (bricks, "
+        "tiles); or all of it is far (sky), and an angle between the cameras is off",
     ),
     Limit("RIL-660", "beyond", "sides", most=0.1, remedy="the calibration's toe-in or principal points are wrong"),
     Limit("RIL-773", "unlike", "sides", most=0, remedy="look at both images: torn, exchanged, or of another frame?"),
@@ -195,7 +191,8 @@ def judge(subject: str, text: str, figures: Mapping[str, float] | None = None) -
 
 
 def judge_rig(rig: Rig) -> Finding:
-    """Baseline, sides and focal lengths of the calibration."""
+    """Baseline, sides and focal lengths of the calibration; whether sides and lenses are those of the images, matches
+    show."""
     left, right, b, x = rig.left, rig.right, rig.baseline, -float(rig.centre[0])
     # In pixels and in image widths: equal lenses with sensors of unlike pixels, or of unlike width, are no mistake.
     ratios = right.fx / left.fx, right.fx / left.fx * left.width / right.width
@@ -204,8 +201,7 @@ def judge_rig(rig: Rig) -> Finding:
     if (right.width, right.height) != (left.width, left.height) or unlike > MAX_ALIKE_SCALE:
         words += f", right {right.fx:g} px, {right.width} x {right.height}"
     words += f"; the right camera stands {x:g} m to the left" if x > 0 else ""
-    figures = {"baselines to the left": x / b, "baseline, m": b, "ratio of the focal lengths": unlike}
-    return judge("rig", words, figures)
+    return judge("rig", words, {"baseline, m": b})
 
 
 # -- records of the chosen frames of a sequence ----------------------------------------------------------------------
@@ -294,13 +290,13 @@ def judge_attitude(of: Sequence, frames: Frames) -> Finding | None:
 
 
 def judge_up(of: Sequence, frames: Frames) -> Finding | None:
-    """Whether the stated vertical is plausible."""
+    """Whether the vertical is stated; ground above the cameras shows that it has the wrong sign."""
     if of.up is None:
         return None
     known = [v for v in (of.up[k] for k in frames) if v is not None]
     y = float(np.mean([v[1] for v in known])) if known else 0.0
     words = f"known of {len(known)} of {len(frames)} frames" + ("; it points down in the images" if y > 0 else "")
-    return judge("up", words, {"known": len(known), "y in the images": y})
+    return judge("up", words, {"known": len(known)})
 
 
 RECORDS = (judge_times, judge_truth, judge_odometry, judge_positions, judge_attitude, judge_up)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.epipolar import NAMES, distances
+from rille.stages.geometry.epipolar import NAMES, distances, turn_axes
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 
@@ -217,9 +217,10 @@ def _linear(rig: Rig, matches: PointPairs, x: Floats) -> Linear:
     """Distances of a corrected rig with systematic errors about ``x``."""
     distance, slopes = distances(rig, x[:RIG], matches.left, matches.right)
     by_rig, by_point = slopes[:, :RIG], slopes[:, RIG:]
-    # A principal point further right (down) by a pixel, compensated by yaw (pitch).
-    compensation = by_rig[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
-    shifts = compensation - by_point
+    # A principal point further right (down) by a pixel, compensated by yaw (pitch); then along the axes of the turns.
+    axes = turn_axes(rig)[:2, :2]
+    compensation = (by_rig[:, :2] @ axes.T)[:, [1, 0]] * [-1.0 / rig.right.fx, 1.0 / rig.right.fy]
+    shifts = (compensation - by_point) @ axes
     design = np.column_stack([by_rig, shifts, _smooth_terms(rig, matches)])
     column, row = np.minimum(matches.left.T * BLOCKS / [[rig.left.width], [rig.left.height]], BLOCKS - 1).astype(int)
     return Linear(distance - by_rig @ x[:RIG], design, x, row * BLOCKS + column)

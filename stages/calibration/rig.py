@@ -48,7 +48,8 @@ from rille.stages.geometry.epipolar import (
     corrected,
     distances,
     image_turn,
-    standing,
+    standing_right,
+    turn_axes,
 )
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
@@ -223,11 +224,13 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
     # The offset stands for the angle that causes it, which is not repeated.
-    if standing(rig):
+    if standing_right(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:
         lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"
     parts = [f"{lines} of the right image lie {abs(offset):.2f} px too {where}"]
+    if turn_axes(rig)[0, 1]:  # rows and columns are crossed alike
+        parts, told = [f"the right image lies {abs(offset):.2f} px off the epipolar lines"], ""
     for p in decision.parameters:
         degrees = math.degrees(p.value)
         # Positive roll turns x (right) to y (down): clockwise in the image.
@@ -292,10 +295,11 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
     names = list(per_pair[0]["values"]) if len(per_pair) > 2 else []
     values = np.array([[p["values"][name] for name in names] for p in per_pair])
     sigma = np.array([[p["sigma"][name] for name in names] for p in per_pair])
-    # "lower": one of two states of the rig, not their mean.
-    usual = np.quantile(values, 0.5, axis=0, method="lower") if names else np.zeros(0)
+    columns = [NAMES.index(name) for name in names]
+    # One of two states of the rig, not their mean; and a pair's own, for parameters stand in for each other.
+    usual = values[_most_alike(values, np.concatenate([one.design for one in start])[:, columns])]
     departure = values - usual
-    moved = _row_shifts(start, [NAMES.index(name) for name in names], np.radians(usual), np.radians(departure))
+    moved = _row_shifts(start, columns, np.radians(usual), np.radians(departure))
     moves = []
     for k, name in enumerate(names):
         away = np.abs(departure[:, k])
@@ -310,6 +314,13 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
             )
             moves.append(_Move(what, warning, float(moved[odd].max())))
     return moves
+
+
+def _most_alike(values: Floats, design: Floats) -> int:
+    """Which of some states (n, k) of a rig differs least from all others, by the rows (m, k) that they move."""
+    apart = values[:, None] - values
+    squares = np.einsum("ijk,kl,ijl->ij", apart, design.T @ design, apart, optimize=True)
+    return int(np.argmin(np.sqrt(np.maximum(squares, 0.0)).sum(1)))
 
 
 def _row_shifts(start: Sequence[Linear], columns: list[int], usual: Floats, departure: Floats) -> Floats:

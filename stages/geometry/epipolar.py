@@ -2,8 +2,9 @@
 
 A correction of a rig has five parameters, all zero for the rig as given; the length of the baseline is not one of them,
 since no image shows it. ``pitch``, ``yaw``, ``roll`` (radians) turn the right camera about the x, y and z axis of its
-given frame, its centre held; ``baseline_across`` and ``baseline_forward`` (radians, to first order) turn that centre
-about the left camera's, across the baseline in the image plane and along the optical axis.
+given frame, its centre held (where the baseline is oblique in its image, about :func:`turn_axes`); ``baseline_across``
+and ``baseline_forward`` (radians, to first order) turn that centre about the left camera's, across the baseline in the
+image plane and along the optical axis.
 
 The residual is the distance of the right point from the epipolar line of the left one, in pixels of the right image:
 the first-order (Sampson) error of a correspondence whose left pixel is exact, as it is in a disparity map of the left
@@ -28,14 +29,39 @@ MAX_LINE_DISTANCE_PX = 2.0
 images, .22 to .32 of images one frame apart; in a desert .99, and up to .08."""
 
 
+MAX_OBLIQUE_DEG = 15.0
+"""Angle [degrees] of the baseline in the right image with its rows or columns up to which its own axes serve."""
+
+
 def standing(rig: Rig) -> bool:
-    """Whether one camera stands above the other, so that epipolar lines run along columns instead of rows."""
+    """Whether one camera stands above the other in the left image: epipolar lines run along its columns."""
     return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
+
+
+def turn_axes(rig: Rig) -> Floats:
+    """Axes of pitch, yaw and roll in the right camera's frame, the columns of (3, 3).
+
+    They are those of the camera, unless its image shows the baseline obliquely: there a pitch and a yaw would move it
+    across and along its epipolar lines alike, and no row would tell the two apart. There that of pitch lies along it.
+    """
+    x, y, _ = rig.T_right_left.translation
+    angle = math.remainder(math.atan2(y, x), math.pi)
+    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(MAX_OBLIQUE_DEG)
+    # 0.5: of the baseline. Where it leads along the view, lines radiate and show all turns.
+    if not oblique or math.hypot(x, y) < 0.5 * rig.baseline:
+        return np.eye(3)
+    return rotation_exp([0.0, 0.0, angle])
+
+
+def standing_right(rig: Rig) -> bool:
+    """Whether the baseline leads along the y axis of :func:`turn_axes`, the columns of the right image."""
+    x, y, _ = np.abs(rig.T_right_left.translation @ turn_axes(rig))
+    return bool(y > x)
 
 
 def angle_along(rig: Rig) -> str:
     """Name of the angle that moves the right image along its epipolar lines, and so all disparities."""
-    return "pitch" if standing(rig) else "yaw"
+    return "pitch" if standing_right(rig) else "yaw"
 
 
 def corrected(rig: Rig, correction: Floats) -> Rig:
@@ -46,7 +72,7 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
     if not np.any(correction):
         return rig
     # The turn keeps the centre; the translation follows from both.
-    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
+    rotation = rotation_exp(turn_axes(rig) @ correction[:3]) @ rig.T_right_left.rotation
     centre, _ = _centre(rig, correction)
     return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ centre))
 
@@ -54,7 +80,7 @@ def corrected(rig: Rig, correction: Floats) -> Rig:
 def turned_along(rig: Rig, other: Rig) -> float:
     """Angle of :func:`angle_along`, rad, by which the right camera of an ``other`` rig is turned against that of
     ``rig``."""
-    turn = rotation_log(other.T_right_left.rotation @ rig.T_right_left.rotation.T)
+    turn = rotation_log(other.T_right_left.rotation @ rig.T_right_left.rotation.T) @ turn_axes(rig)
     return float(turn[NAMES.index(angle_along(rig))])
 
 
@@ -63,6 +89,13 @@ def far_shift(rig: Rig, changed: Rig) -> Floats:
     far = np.array([0.0, 0.0, 1e3 * rig.baseline])
     before, after = (one.right.project(one.T_right_left.apply(far)) for one in (rig, changed))
     return np.asarray(after - before)
+
+
+def farther(rig: Rig) -> Floats:
+    """Direction (2,), column and row, in which a point far ahead moves in the right image as its distance grows; zeros
+    where the baseline leads along the view."""
+    along = -rig.T_right_left.translation[:2]
+    return np.asarray(along / max(float(np.linalg.norm(along)), 1e-9 * rig.baseline))
 
 
 def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
@@ -77,11 +110,12 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     left, right : (n, 2) column and row of corresponding points.
     """
     centre, swings = _centre(rig, correction)
-    rotation = rotation_exp(correction[:3]) @ rig.T_right_left.rotation
+    axes = turn_axes(rig)
+    rotation = rotation_exp(axes @ correction[:3]) @ rig.T_right_left.rotation
     # A line of the image with matrix K is K^-T times the normal R (c x ray) of the epipolar plane.
     to_line, to_ray = np.linalg.inv(rig.right.matrix).T, np.linalg.inv(rig.left.matrix)
     # Not at 0: for large corrections, which the fit reaches, turns do not commute.
-    turns = left_jacobian(correction[:3])
+    turns = left_jacobian(axes @ correction[:3]) @ axes
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
     to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]

@@ -7,6 +7,8 @@ epipolar line *and* in front of the cameras.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rille.stages.core.arrays import Floats
@@ -32,8 +34,12 @@ def fits(rig: Rig, left: Floats, right: Floats) -> float:
 def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float]:
     """Whether left and right are exchanged; shares of the matches that fit the rig as given, and the other way."""
     as_given, other_way = fits(rig, left, right), fits(rig, right, left)
-    # Most of the matches fit the other way, and more than twice as many as fit the given one.
-    return other_way > 0.5 and other_way > 2.0 * as_given, as_given, other_way
+    return likelier(other_way, as_given), as_given, other_way
+
+
+def likelier(other: float, given: float) -> bool:
+    """Whether most of the matches fit another rig, and more than twice as many as fit the given one (shares)."""
+    return other > 0.5 and other > 2.0 * given
 
 
 def refuse_mirrored(rig: Rig, left: Floats, right: Floats, fitting: float) -> None:
@@ -66,12 +72,15 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
             "point, is off by that: calibrate anew, and let the images show near ground; if not, left and right are "
             "exchanged, or the sign of the baseline is wrong",
         )
-    if swapped:
+    inverted = fits(replace(rig, T_right_left=rig.T_right_left.inverse()), left, right)
+    if swapped or likelier(inverted, as_given):
+        share, how = max((other_way, "its sides exchanged"), (inverted, "its transformation inverted"))
         raise DegenerateError(
             "RIL-781",
-            f"{other_way:.0%} of the matches fit the rig with its sides exchanged, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, the sign of the baseline, whether the images are "
-            "mirrored or upside down, and whether the scene repeats along the rows (bricks, tiles)",
+            f"{share:.0%} of the matches fit the rig with {how}, {as_given:.0%} as given",
+            remedy="check left/right order, they seem swapped, the sign of the baseline, whether its transformation "
+            "leads from right to left, whether the images are mirrored or upside down, and whether the scene repeats "
+            "along the rows (bricks, tiles)",
         )
     if beyond > 0.5:
         raise BeyondInfinityError(

@@ -156,6 +156,13 @@ class PlaneView:
         near = self.slant <= 2.0 * self.slant.min()
         return rounded_cell(float(np.sqrt(self.along * self.across)[near].max()))
 
+    def sure_cell(self, sigma_d: float) -> float:
+        """The least of 1, 2, 5 ... that is no less than the error of elevation, at ``sigma_d`` pixels of disparity, of
+        half of the plane up to twice the nearest distance."""
+        least = float(np.median((sigma_d / self.slope)[self.slant <= 2.0 * self.slant.min()]))
+        cell = rounded_cell(least)
+        return cell if cell >= least else rounded_cell(2.2 * cell)
+
     def footprint(self, cell: float, max_cells: float, sigma_d: float, max_sigma: float) -> list[float]:
         """Extent x_min, x_max, y_min, y_max, metres, of the plane that is seen well enough.
 

@@ -203,7 +203,14 @@ def _on_ground(ground: GroundPlane, R_local_left: Floats, samples: Samples, rig:
     plane = _local_plane(ground, R_local_left)
     view = view_ground(rig, R_local_left, plane)
     cell = view.cell_size()
-    footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, cell)
+    try:
+        footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, cell)
+    except CoarseGroundError:
+        # Of a short baseline or from high above: what is known to be level is ground, in cells that the depths allow.
+        if source == GROUND_PLANE:
+            raise
+        cell = max(cell, view.sure_cell(samples.sigma_px))
+        footprint = view.footprint(cell, DEFAULT_RANGE_CELLS, samples.sigma_px, cell)
     points = (samples.rays / np.maximum(samples.rho, 1e-12)[:, None]) @ R_local_left.T
     relief = _relief(points[samples.rho > 0], plane, footprint, ground.height)
     facts = _facts(RigidTransform(R_local_left, np.zeros(3)), source, cell, (plane, relief, footprint))

@@ -697,7 +697,6 @@ def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, fil
     [
         ({"rig": "[rig]\nbaseline = 97\n"}, ("RIL-244", "0.097 or 0.97")),
         ({"rig": "[rig]\nbaseline = -0.1\n"}, ("RIL-223", "-0.1")),
-        ({"rig": "[rig]\nT_right_left = [[1,0,0,0.1],[0,1,0,0],[0,0,1,0]]\n"}, ("RIL-130",)),
         (
             {"rig": "[rig]\nT_right_left = [[1,0,0],[0,1,0],[0,0,1]]\n"},
             ("RIL-223", "rig.T_right_left"),

@@ -268,9 +268,11 @@ def test_an_installed_package_adds_a_layout_and_the_current_folder_none(installe
 
 @pytest.mark.parametrize("folder", ["seq", "baseline"])
 def test_another_warning_about_the_place_of_the_baseline_is_none_about_the_baseline(tmp_path, folder):
-    """The focal lengths differ much, and a principal point is off."""
+    """The baseline is long, and a principal point is off."""
     figures = "{{ fx = {}, cx = 31.5, cy = {} }}"
-    cameras = f"[cameras]\nleft = {figures.format(60.0, 35.5)}\nright = {figures.format(400.0, 23.5)}\n"
-    path = write_sequence(tmp_path / folder, cameras=cameras)
+    cameras = f"[cameras]\nleft = {figures.format(60.0, 35.5)}\nright = {figures.format(60.0, 23.5)}\n"
+    path = write_sequence(
+        tmp_path / folder, cameras=cameras, rig="[rig]\nunit = 1.0\nT_right_left = [[1,0,0,-7],[0,1,0,0],[0,0,1,0]]\n"
+    )
     lines = settings_of_run(str(path), Work(), warn=lambda _: None).sequence.warnings
-    assert {line[:7] for line in lines} == {"RIL-689", "RIL-642"}
+    assert {line[:7] for line in lines} == {"RIL-689", "RIL-641"}

@@ -23,7 +23,14 @@ from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
-from rille.stages.calibration.target import LEAST_VIEWS, MODELS, BoardView, RigCalibration, calibrate_rig, check_sides
+from rille.stages.calibration.target import (
+    LEAST_VIEWS,
+    MODELS,
+    BoardView,
+    RigCalibration,
+    calibrate_rig,
+    refuse_one_place,
+)
 from rille.stages.core.errors import InputError, told, warning
 from rille.stages.geometry.geometry import Sizes
 
@@ -101,7 +108,7 @@ def calibrate(
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
     _refuse_clutter(rig, boards)
-    check_sides(rig)
+    refuse_one_place(rig)
     atomic.write(output, _yaml(rig, boards, square))
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {square:g} m")

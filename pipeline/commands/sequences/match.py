@@ -48,8 +48,8 @@ def match(
     dense
         Fill undefined disparities by interpolation.
     confidence
-        TIFF to write with the bands disparity_std (pixels, standard deviation of the column), validity (bits) and
-        backmatch_error (pixels).
+        TIFF to write with the bands disparity_std (pixels, standard deviation along the epipolar line), validity (bits)
+        and backmatch_error (pixels).
     """
     nested = configuration.parse_assignments(assignments)
     configuration.refuse_other_sections(nested, ("hfvm",), "match")

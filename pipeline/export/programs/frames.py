@@ -53,7 +53,7 @@ def _products(one: PlacedPair) -> Iterator[tuple[str, Bands, str, str]]:
     there = matched(np.asarray(one.disparity["validity"]))
     names = "column_disparity", "row_disparity", "disparity_std"
     bands = {name: np.where(there, one.disparity[name], np.float32(np.nan)) for name in names}
-    yield "DSP", bands, "pixel", "right minus left, and the standard deviation of the column"
+    yield "DSP", bands, "pixel", "right minus left, and its standard deviation along the epipolar line"
 
 
 def _named(names: str, values: Any) -> Bands:

@@ -92,16 +92,31 @@ def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
     return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
 
 
+def errors_of(side: str, rig: Rig, errors: Sequence[float] | Floats) -> Floats:
+    """The first of ``errors``, stated for the left camera, of the camera of a ``side``.
+
+    Both cameras err alike as the left image shows it, so that disparities stay: what errs along the columns of the one
+    does along the rows of the other, if that lies on its side.
+    """
+    larger, *centre = errors[:CORRECTED]
+    if side == "right":
+        (cosine, _, _), (sine, _, _), _ = rig.T_right_left.rotation
+        turned = complex(*centre) * complex(cosine, sine) / math.hypot(cosine, sine)
+        centre = [turned.real, turned.imag]
+    return np.array([larger, *centre])
+
+
 def corrected_rig(
     rig: Rig, errors: Sequence[float] | Floats, yaw: float, pitch: float = 0.0, others: Sequence[float] = (0.0,) * 3
 ) -> Rig:
     """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
 
-    Where one camera stands above the other, pitch and yaw change places.
+    Where a pitch moves all disparities, as of cameras one above the other, pitch and yaw change places.
     """
-    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
+    first = [yaw, pitch] if epipolar.standing_right(rig) else [pitch, yaw]
     turned = epipolar.corrected(rig, np.array([*first, *others]))
-    return replace(turned, left=corrected(rig.left, errors), right=corrected(rig.right, errors))
+    left, right = (errors_of(side, rig, errors) for side in ("left", "right"))
+    return replace(turned, left=corrected(rig.left, left), right=corrected(rig.right, right))
 
 
 def toed_in(rig: Rig, angle: float) -> Rig:
@@ -132,7 +147,7 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
             raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
-            again = replace(lens, camera=corrected(lens.camera, errors))
+            again = replace(lens, camera=corrected(lens.camera, errors_of(side, rig, errors)))
             pixels = again.undistort(raw, ideal).reshape(pixels.shape)
         focal, centre = np.array([ideal.fx, ideal.fy]), np.array([ideal.cx, ideal.cy])
         ray = (pixels - centre) / focal

@@ -152,11 +152,11 @@ def alone(shown: Floats, least: float, *, change: bool = False) -> tuple[CommonE
 
 
 def px_per_yaw(rig: Rig) -> float:
-    """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it."""
+    """Error of all disparities, px, that a yaw of the rig makes, per radian, as far landmarks in the middle show it; 0
+    where the baseline leads along the view."""
     shift = epipolar.far_shift(rig, corrected_rig(rig, np.zeros(CORRECTED), STEP))
-    # Towards the right camera's side points are farther; what a changed rig adds there the same pixels lack.
-    farther = rig.centre[:2] / np.linalg.norm(rig.centre[:2])
-    return -float(shift @ farther) / STEP
+    # What a changed rig adds towards what is farther the same pixels lack.
+    return -float(shift @ epipolar.farther(rig)) / STEP
 
 
 def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
@@ -170,7 +170,8 @@ def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
         return 0.0
     usual = float(np.median(biases))
     agreed = abs(usual) > MIN_YAW_PX and mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual)
-    return usual / px_per_yaw(rig) if agreed else 0.0
+    px = px_per_yaw(rig)
+    return usual / px if agreed and px else 0.0
 
 
 def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
@@ -213,11 +214,12 @@ def creeping_focus(segments: Sequence[Bundle[ResectFacts]], turn: float, rig: Ri
     corrected yaw that is none puts landmarks at wrong distances, and the pair at a segment's end shows these.
     """
     shown = np.array([s.meta["distance_px"] for s in segments if "distance_px" in s.meta])
-    if not turn or len(shown) < MIN_SEGMENTS:
+    expected = turn * px_per_yaw(rig)
+    if not expected or len(shown) < MIN_SEGMENTS:
         return ""
     usual, error = float(np.median(shown)), 5.0 * mad_sigma(shown) / math.sqrt(len(shown))
     # 0.3: of the correction. A street whose focus is fixed shows -0.4 to -0.3 px, 0.4 to 2 times the correction others.
-    if abs(usual) < max(MIN_DISTANCE_PX, error) or -usual / (turn * px_per_yaw(rig)) < 0.3:
+    if abs(usual) < max(MIN_DISTANCE_PX, error) or -usual / expected < 0.3:
         return ""
     return (
         "the focus of both cameras creeps, or what is near moves alike (water), and the yaw of the rig was not wrong: "
@@ -277,7 +279,7 @@ def intrinsics_stage(
     straight = ~turning | (turning.sum() < MIN_SEGMENTS)
     information[straight], pull[straight] = of_toe_in(information[straight], pull[straight], params.sigma)
     used = Rig.from_dict(rig.meta["rig"])
-    focal, upright = used.left.fx, epipolar.standing(used)
+    focal, upright = used.left.fx, epipolar.standing_right(used)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     common = common_errors(information, pull, params.sigma, least=MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR)

@@ -252,17 +252,17 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
     use, off, depth = segment.inlier[:, -1] != 0, [], []
-    side = 1 if epipolar.standing(then) else 0
+    side, axes = int(epipolar.standing_right(then)), epipolar.turn_axes(then)[:2, :2]
     for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
         disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
         at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)
         right = rig.right.project(rig.T_right_left.apply(at))
         depth.append(at[:, 2])
         use &= matched
-        error = disparity - (right - rig.left.project(at))
+        error = (disparity - (right - rig.left.project(at))) @ axes
         # A turn of the camera moves what is aside farther than what is in the middle.
-        error[:, side] /= 1.0 + rig.right.rays(right)[:, side] ** 2
-        off.append(error)
+        error[:, side] /= 1.0 + (rig.right.rays(right)[:, :2] @ axes)[:, side] ** 2
+        off.append(error @ axes.T)
     if use.sum() < MIN_LANDMARKS:
         return {}
     departs = (off[1][use] - off[0][use]) / unit
@@ -274,8 +274,7 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     if torn > MAX_TORN_SHARE and use.sum() >= 0.25 * len(use):
         return {"torn": torn}
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
-        farther = then.centre[:2] / np.linalg.norm(then.centre[:2])
-        return {"distance_px": float(grown @ farther) * unit}
+        return {"distance_px": float(grown @ epipolar.farther(then)) * unit}
     line = (
         f"the rig moved at pair {segment.facts[-1]['frame']}: its disparities depart by {jump[0]:+.1f} px in the column"
         f", {jump[1]:+.1f} px in the row from those of pair {segment.facts[0]['frame']}"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from toys.finished import BASIC, TASKS, Written, bundles, products, report, view, written
 
 from rille.datasets.georeference import Georeference
@@ -22,7 +23,7 @@ from rille.pipeline.report.delivery import lacking
 from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.odometry.resection.trajectory import Chained, account
 from rille.stages.planning.path import PathParams
@@ -372,25 +373,21 @@ def test_a_curve_of_many_frames_does_not_fill_the_page() -> None:
     assert size(4000) < 10 * size(400)
 
 
+@pytest.mark.parametrize("roll", [0.0, 1.57, 3.14])
 @pytest.mark.parametrize(
-    ("centre", "band", "sign"),
-    [
-        ((0.1, 0.01, 0.0), "column_disparity", 1),
-        ((-0.1, 0.01, 0.0), "column_disparity", -1),
-        ((0.01, 0.1, 0.0), "row_disparity", 1),
-        ((0.01, -0.1, 0.0), "row_disparity", -1),
-    ],
+    "centre", [(0.1, 0.01, 0.0), (-0.1, 0.0, 0.0), (0.01, 0.1, 0.0), (0.0, -0.1, 0.0), (0, 0, 0.2)]
 )
-def test_near_points_have_the_smaller_disparity_along_the_baseline(
-    centre: tuple[float, float, float], band: str, sign: int
-) -> None:
-    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
-    rig = Rig(camera, camera, RigidTransform(np.eye(3), -np.array(centre)))
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
-    near, far = camera.project(rig.T_right_left.apply(points)) - camera.project(points)
-    assert strips.depth_band(rig) == (band, sign)
-    axis = ("column_disparity", "row_disparity").index(band)
-    assert sign * near[axis] < sign * far[axis]
+def test_near_pixels_of_a_pair_are_yellow_and_far_ones_blue(centre: tuple[float, float, float], roll: float) -> None:
+    camera, rotation = Camera(60.0, 60.0, 31.5, 23.5, 64, 48), rotation_exp([0.0, 0.0, roll])
+    rig = Rig(camera, camera, RigidTransform(rotation, -rotation @ np.array(centre)))
+    pixels = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), -1)
+    depth = np.where(pixels[..., :1] < 32, 1.0, 5.0)
+    column, row = np.moveaxis(rig.right.project(rig.T_right_left.apply(depth * camera.rays(pixels))) - pixels, -1, 0)
+    maps = {"column_disparity": column, "row_disparity": row, "validity": np.ones((48, 64), np.uint8)}
+    photo = Image.new("RGBA", (32, 24), "black")
+    left, right = np.asarray(strips.matches_picture(photo, Bundle(maps, {}), rig))[12, [4, -4], :3].astype(int)
+    assert (left[:2] > left[2] + 50).all()
+    assert right[2] > right[:2].max()
 
 
 def test_both_cameras_are_told_where_they_differ(tmp_path: Path) -> None:

@@ -24,10 +24,8 @@ def rig(x: float, right: Camera = CAMERA) -> Rig:
     return Rig(CAMERA, right, RigidTransform(np.eye(3), np.array([x, 0.0, 0.0])))
 
 
-@pytest.mark.parametrize(
-    ("x", "level"), [(-0.12, "OK"), (-97.0, "WARN"), (-0.001, "WARN"), (0.12, "FAIL"), (-4.9, "OK")]
-)
-def test_baseline_and_sides(x, level):
+@pytest.mark.parametrize(("x", "level"), [(-0.12, "OK"), (-97.0, "WARN"), (-0.001, "WARN"), (0.12, "OK"), (-4.9, "OK")])
+def test_a_baseline_in_another_unit_and_cameras_in_any_order(x, level):
     assert input_checks.judge_rig(rig(x)).level == level
 
 
@@ -36,17 +34,14 @@ def test_a_right_camera_upside_down_stands_where_it_stands():
     assert input_checks.judge_rig(Rig(CAMERA, CAMERA, upside_down)).level == "OK"
 
 
-def test_two_lenses():
-    assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 160.0, 120.0, 320, 240))).level == "WARN"
-
-
-def test_a_camera_of_another_size_is_stated_and_no_mistake():
+def test_another_camera_is_stated_and_no_mistake():
     half = input_checks.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
     assert half.level == "OK"
     assert half.text.endswith("500 px, 320 x 240, right 250 px, 160 x 120")
     wide = Camera(500.0, 500.0, 320.0, 120.0, 640, 240)
     assert input_checks.judge_rig(rig(-0.1, wide)).level == "OK"
-    assert input_checks.judge_rig(rig(-0.1, Camera(700.0, 700.0, 80.0, 60.0, 160, 120))).level == "WARN"
+    tele = input_checks.judge_rig(rig(-0.1, Camera(1000.0, 1000.0, 160.0, 120.0, 320, 240)))
+    assert (tele.level, tele.text[-24:]) == ("OK", "right 1000 px, 320 x 240")
 
 
 def recorded(frames: int, **known) -> tuple[Sequence, range]:
@@ -145,10 +140,11 @@ def test_positions_are_counted_within_the_time_of_the_images(change, level, word
     assert input_checks.judge_positions(*recorded(3)) is None
 
 
-def test_up_points_up():
+def test_up_is_stated():
     assert input_checks.judge_up(*recorded(1)) is None
     assert input_checks.judge_up(*recorded(1, up=[(0.0, -1.0, 0.0)])).level == "OK"
-    assert input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)])).level == "WARN"
+    turned = input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)]))  # of a camera that is mounted upside down
+    assert (turned.level, turned.text.split("; ")[1]) == ("OK", "it points down in the images")
     assert input_checks.judge_up(*recorded(1, up=[None])).level == "WARN"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from fnmatch import fnmatch
 
 import numpy as np
 import pytest
@@ -131,13 +132,25 @@ def test_a_yaw_that_the_tracks_have_corrected_is_not_said_to_be_held():
     assert not any("yaw" in line for line in found["warnings"])
 
 
-def test_words_of_a_knock_where_one_camera_stands_above_the_other():
-    rig = street_rig()
-    standing = replace(rig, T_right_left=RigidTransform(np.eye(3), np.array([0.0, -rig.baseline, 0.0])))
-    pairs = [matches(knocked(standing, yaw_deg=0.24, roll_deg=0.3), street_depth, pair=k) for k in range(2)]
-    line = facts(standing, pairs)["warnings"][0]
-    assert "columns of the right image lie 3." in line
-    assert " px too far right, it is turned by 0.30 degrees clockwise" in line
+@pytest.mark.parametrize(
+    ("centre", "roll", "angle", "words"),
+    [
+        ((0.0, 0.5, 0.0), 0.0, "yaw", "columns of the right image lie 3.* px too far right, it is"),
+        ((0.5, 0.0, 0.0), 90.0, "yaw", "columns of the right image lie 3.* px too far right, it is"),
+        (
+            (0.35, 0.35, 0.0),
+            0.0,
+            "pitch",
+            "the right image lies 3.* px off the epipolar lines, pitch is off by *, it is",
+        ),
+    ],
+)
+def test_words_of_a_knock_where_epipolar_lines_are_no_rows(centre, roll, angle, words):
+    camera, rotation = street_rig().left, rotation_exp([0.0, 0.0, np.radians(roll)])
+    rig = Rig(camera, camera, RigidTransform(rotation, -rotation @ np.array(centre)))
+    true = knocked(rig, roll_deg=0.3, **{f"{angle}_deg": 0.24})
+    line = facts(rig, [matches(true, street_depth, pair=k) for k in range(2)])["warnings"][0]
+    assert fnmatch(line, f"*: {words} turned by 0.30 degrees clockwise*")
 
 
 def test_mode_fixed_only_tells():
@@ -244,6 +257,19 @@ def test_parameters_that_stand_in_for_each_other_do_not_move_the_rig():
         last = replace(start[-1], constant=start[-1].constant - design @ by) if shown else start[-1]
         return [move.warning for move in _drift([*start[:-1], last], rows, RigParams())]
 
+    def scattered(shares):
+        by = np.outer(shares, away)
+        rows = [
+            {"pair": k, "values": dict(zip(NAMES, row, strict=True)), "sigma": dict.fromkeys(NAMES, 1e-3)}
+            for k, row in enumerate(np.degrees(by))
+        ]
+        shown = [
+            replace(one, constant=one.constant - one.design[:, :RIG] @ row) for one, row in zip(start, by, strict=False)
+        ]
+        return [move.warning for move in _drift(shown, rows, RigParams())]
+
+    # No pair has the usual value of each parameter.
+    assert scattered([1.0, 0.7, -0.9, -0.6]) == []
     alone = 2.0 * np.where(np.arange(RIG) == strong, away, 0.0)
     assert told(away, shown=True) == []
     assert told(alone, shown=False) == []  # what the pair's own values claim and its rows do not show
@@ -265,6 +291,18 @@ def test_swapped_images_are_named():
     pairs = [PointPairs(m.pair, m.right, m.left) for m in street(2)]
     with raises("RIL-781"):
         facts(street_rig(), pairs)
+
+
+@pytest.mark.parametrize("centre", [(0.54, 0.0, 0.0), (-0.54, 0.0, 0.0), (0.0, 0.54, 0.0), (0.4, 0.0, 0.4)])
+def test_an_inverted_transformation_is_named_and_cameras_in_any_order_are_not(centre):
+    """Whose principal points are not alike, so that exchanged sides do not explain the matches."""
+    camera = street_rig().left
+    right = replace(camera, cx=camera.cx - 12.0, cy=camera.cy + 12.0)
+    rig = Rig(camera, right, RigidTransform(np.eye(3), np.negative(centre)))
+    pairs = [matches(rig, street_depth, pair=k, samples=800) for k in range(2)]
+    assert facts(rig, pairs)["warnings"] == []
+    with raises("RIL-781", "its transformation inverted"):
+        facts(replace(rig, T_right_left=rig.T_right_left.inverse()), pairs)
 
 
 @pytest.mark.parametrize("off", [-2.5, -9.0])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig, check_sides
+from rille.stages.calibration.target import MODELS, Adjustment, BoardView, calibrate_rig, refuse_one_place
 from rille.stages.core.errors import DegenerateError
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
@@ -223,13 +223,20 @@ def test_what_cannot_be_calibrated_says_so():
     views = scene("radtan4", 6)
     with raises("RIL-309"):
         calibrate_rig(BOARD, views[:2], SIZES, "radtan4")
-    swapped = [BoardView(v.name, v.right, v.left) for v in views]
-    with raises("RIL-310"):
-        check_sides(calibrate_rig(BOARD, swapped, SIZES, "radtan4"))
     noise = scene("radtan4", 6, noise=0.1)
     twice = [BoardView(v.name, v.left, v.left + 0.01 * (w.left - v.left)) for v, w in zip(views, noise, strict=True)]
     with raises("RIL-313", "one place"):
-        check_sides(calibrate_rig(BOARD, twice, (SIZES[0], SIZES[0]), "radtan4"))
+        refuse_one_place(calibrate_rig(BOARD, twice, (SIZES[0], SIZES[0]), "radtan4"))
+
+
+def test_cameras_stand_in_any_order():
+    views = scene("radtan4", 6)
+    usual, exchanged = (
+        calibrate_rig(BOARD, one, SIZES, "radtan4")
+        for one in (views, [BoardView(v.name, v.right, v.left) for v in views])
+    )
+    refuse_one_place(exchanged)
+    np.testing.assert_allclose(exchanged.T_right_left.inverse().matrix34, usual.T_right_left.matrix34, atol=1e-3)
 
 
 def test_a_right_camera_upside_down_stands_where_it_stands():

@@ -11,8 +11,18 @@ from hypothesis import strategies as st
 from rig_scenes import bed_depth, bed_rig, knocked, matches, street_depth, street_rig
 from terrain_scenes import toed_in_rig
 
-from rille.stages.geometry.epipolar import NAMES, beyond_infinity, corrected, depth_sensitivity, distances
-from rille.stages.geometry.geometry import Rig, RigidTransform
+from rille.stages.geometry.epipolar import (
+    NAMES,
+    angle_along,
+    beyond_infinity,
+    corrected,
+    depth_sensitivity,
+    distances,
+    far_shift,
+    farther,
+    turned_along,
+)
+from rille.stages.geometry.geometry import Rig, RigidTransform, rotation_exp
 
 RIGS = {"street": street_rig(), "bed": bed_rig(), "unequal cameras": toed_in_rig()}
 ANGLE = st.floats(-0.1, 0.1)
@@ -45,7 +55,16 @@ def test_exact_matches_lie_on_their_lines(name):
     np.testing.assert_allclose(distances(rig, ZERO, m.left, m.right)[0], 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("rig", [*RIGS.values(), vertical_rig()], ids=[*RIGS, "vertical"])
+def rolled_rig(degrees: float, centre: tuple[float, float, float] = (0.5, 0.0, 0.0)) -> Rig:
+    """Right camera at ``centre``, m, of the left one's frame, turned in its image plane."""
+    rig, rotation = street_rig(), rotation_exp([0.0, 0.0, math.radians(degrees)])
+    return Rig(rig.left, rig.right, RigidTransform(rotation, -rotation @ np.array(centre)))
+
+
+ODD = {"vertical": vertical_rig(), "rolled": rolled_rig(40.0), "oblique": rolled_rig(0.0, (0.3, 0.4, 0.1))}
+
+
+@pytest.mark.parametrize("rig", [*RIGS.values(), *ODD.values()], ids=[*RIGS, *ODD])
 @given(c=st.tuples(*[ANGLE] * 5))
 @settings(max_examples=15, deadline=None)
 def test_derivatives_are_those_of_central_differences(rig, c):
@@ -70,6 +89,36 @@ def test_correction_keeps_the_baseline_and_is_what_distances_mean(c):
     left, right = np.array([[10.0, 20.0], [200.0, 150.0]]), np.array([[5.0, 25.0], [180.0, 149.0]])
     here, _ = distances(rig, np.array(c), left, right)
     np.testing.assert_allclose(here, distances(there, ZERO, left, right)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rig", "name"),
+    [
+        (street_rig(), "yaw"),
+        (vertical_rig(), "pitch"),
+        *[
+            (rolled_rig(roll), name)
+            for roll, name in ((90.0, "pitch"), (-90.0, "pitch"), (180.0, "yaw"), (30.0, "yaw"))
+        ],
+        *[(rolled_rig(roll), "yaw") for roll in (44.0, 46.0, 60.0, 134.0, -46.0)],
+        (rolled_rig(90.0, (0.01, 0.5, 0.0)), "yaw"),
+    ],
+)
+def test_one_angle_moves_the_right_image_along_its_lines_and_one_across(rig, name):
+    far = np.array([[600.0, 180.0]])
+    right = rig.right.project(rig.T_right_left.apply(rig.left.rays(far) * 1e6))
+    slopes = distances(rig, ZERO, far, right)[1][0, :2]
+    along = NAMES.index(name)
+    assert angle_along(rig) == name
+    assert abs(slopes[along]) < 0.02 * abs(slopes[1 - along])
+    turned = corrected(rig, 1e-4 * np.eye(5)[along])
+    moved = far_shift(rig, turned)
+    assert abs(moved @ farther(rig)) == pytest.approx(np.linalg.norm(moved), rel=1e-3)
+    assert turned_along(rig, turned) == pytest.approx(1e-4)
+
+
+def test_where_the_baseline_leads_along_the_view_nothing_is_farther():
+    assert not farther(rolled_rig(0.0, (0.0, 0.0, 0.5))).any()
 
 
 def test_no_correction_is_the_same_rig():

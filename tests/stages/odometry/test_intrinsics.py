@@ -161,13 +161,17 @@ def test_a_wrong_number_is_corrected_where_the_camera_turns(number, by, lens):
 
 
 @pytest.mark.parametrize("lens", [Lens(CAMERA), BENT], ids=["pinhole", "lens"])
-def test_right_numbers_are_believed(lens):
-    facts = facts_of(CAMERA, lens, 0.1)
+@pytest.mark.parametrize("roll", [0.0, 1.5, 2.9])
+def test_right_numbers_are_believed(lens, roll):
+    turned = rotation_exp([0.0, 0.0, roll])
+    facts = facts_of(CAMERA, lens, 0.1, base=RigidTransform(turned, turned @ T_RIGHT_LEFT.translation))
     assert "contradiction" not in facts
     assert facts["correction"] == [0.0] * (CORRECTED + 1)
     errors, sigma = np.array(list(facts["errors"].values())).T
     assert (np.abs(errors) < 4.0 * sigma).all()
     assert NAMES[0] not in facts["held"]
+    # A principal point that is off in both images alike leaves disparities as they are, however the right one lies.
+    assert sigma[NAMES.index("toe-in")] < 0.05 * SIGMA[NAMES.index("toe-in")]
 
 
 def test_a_straight_drive_rests_on_the_given_numbers_and_their_prior():
@@ -203,10 +207,20 @@ def test_poses_are_corrected_for_a_toe_in_that_a_straight_drive_shows(angle, cen
 
 
 @pytest.mark.parametrize("yaw", [0.003, -0.006])
-@pytest.mark.parametrize(("centre", "name"), [((-0.12, 0.0, 0.0), "yaw"), ((0.01, -0.12, 0.0), "pitch")])
-def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, name):
-    """Of cameras one above the other, it is the pitch that moves all disparities."""
-    off, before, base = yaw, 0.0, RigidTransform(np.eye(3), np.array(centre))
+@pytest.mark.parametrize(
+    ("centre", "roll", "name"),
+    [
+        ((-0.12, 0.0, 0.0), 0.0, "yaw"),
+        ((0.01, -0.12, 0.0), 0.0, "pitch"),
+        ((-0.12, 0.0, 0.0), -1.5, "pitch"),
+        ((-0.08, 0.09, 0.0), 0.0, "yaw"),
+        ((-0.12, 0.0, 0.0), -0.6, "yaw"),
+    ],
+)
+def test_a_wrong_yaw_is_corrected_on_a_straight_drive(yaw, centre, roll, name):
+    """Of cameras one above the other, or one on its side, it is the pitch that moves all disparities."""
+    turned = rotation_exp([0.0, 0.0, roll])
+    off, before, base = yaw, 0.0, RigidTransform(turned, turned @ np.array(centre))
     for _ in range(4):
         facts = facts_of(CAMERA, Lens(CAMERA), turn=0.0, yaw=off, base=base, before=[0.0, 0.0, 0.0, before])
         assert facts["correction"][:CORRECTED] == [0.0] * CORRECTED

@@ -227,6 +227,22 @@ def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
     assert local_lattice(view, cell, params.model_copy(update={"max_sigma": sigma})).rows > 0
 
 
+@pytest.mark.parametrize("pitch", [40.0, 90.0])
+def test_ground_that_is_known_to_be_level_has_cells_that_a_short_baseline_allows(pitch: float) -> None:
+    """A pixel covers 5 mm of it, and a depth errs by 10 times as much."""
+    pose = pitched(pitch)
+    column, row, usable = disparity(RIG, pose, plane(0.0, 0.0, -3.0))
+    known = level(column, row, usable, RIG, PARAMS, VerticalHint(up=pose.rotation[2]))
+    assert "no_ground" not in known
+    assert known["plane"][2] == pytest.approx(-3.0, abs=1e-3)
+    view = view_ground(RIG, RigidTransform.from_matrix(known["T_local_left"]).rotation, known["plane"])
+    assert known["cell_size"] > view.cell_size()
+    near = view.slant <= 2.0 * view.slant.min()
+    error = np.median(PARAMS.sigma_disparity / view.slope[near])
+    assert error <= known["cell_size"] <= 2.5 * error
+    assert "no_ground" in level(column, row, usable, RIG, PARAMS)
+
+
 WALL = pitched(90.0)
 """Of a camera that looks at a wall z = -1.5 + 0.2 x, which a ball of half its points hides in part."""
 
