@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.poses import coverage, meanings, refuse_apart, times_of
+from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, Vector, rows_of, vector_of
+from rille.datasets.text.columns import meanings
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES, unitless
 from rille.stages.core.arrays import Bools, Floats

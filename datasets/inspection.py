@@ -26,16 +26,8 @@ from rille.datasets.images.headers import located, sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import (
-    QUATERNION,
-    matrix_at,
-    meanings,
-    of_images,
-    of_photographs,
-    of_poses,
-    positions_of,
-    untimed,
-)
+from rille.datasets.poses import of_images, of_poses, positions_of
+from rille.datasets.text.columns import QUATERNION, matrix_at, meanings, of_photographs, untimed
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError, RilleError

@@ -32,16 +32,14 @@ from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import (
     TimedPoses,
     TimedPositions,
-    columns_of_places,
     coverage,
     interpolate,
-    meanings,
     poses_of,
     positions_of,
     read_motion,
     refuse_apart,
-    unread_rotations,
 )
+from rille.datasets.text.columns import columns_of_places, meanings, unread_rotations
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
