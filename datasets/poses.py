@@ -30,19 +30,9 @@ import numpy as np
 
 from rille.datasets.georeference import projected
 from rille.datasets.images.files import SUFFIXES
+from rille.datasets.text import columns as by_name
 from rille.datasets.text import units
-from rille.datasets.text.columns import (
-    ANGLES,
-    POSITION,
-    QUATERNION,
-    UNTIMED,
-    have_rotation,
-    matrix_at,
-    meanings,
-    of_photographs,
-    stated_column,
-    untimed,
-)
+from rille.datasets.text.columns import ANGLES, POSITION, QUATERNION, UNTIMED, meanings, stated_column
 from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
@@ -140,9 +130,9 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
         images = tuple(table.text(len(IMAGES) - 1))
         return TimedPoses(None, tuple(pose.inverse() for pose in poses), table.name, images=images)
     meant = meanings(table)
-    first = matrix_at(table)
+    first = by_name.matrix_at(table)
     shaped = first is not None or table.columns in (12, 16)
-    if format == "kitti" or (format == "auto" and shaped and not have_rotation(meant)):
+    if format == "kitti" or (format == "auto" and shaped and not by_name.have_rotation(meant)):
         return _of_matrices(table, 1.0 if unit is None else unit, timed=first == 1)
     columns = _columns(table, format, meant)
     warnings, quaternion = _of_degrees(table), columns.keys() >= set(QUATERNION)
@@ -236,9 +226,9 @@ def positions_of(
     meant = {meaning: k for meaning, k in meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
-    posed = have_rotation(meant) or many or matrix_at(table) is not None or untimed(table)
+    posed = by_name.have_rotation(meant) or many or by_name.matrix_at(table) is not None or by_name.untimed(table)
     # Beside degrees, and names of images, nothing says in which frame angles are.
-    if not columns and posed and not (table.crs or of_photographs(table)):
+    if not columns and posed and not (table.crs or by_name.of_photographs(table)):
         return None
     degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
     if len(known) < 2 or (degrees and not table.crs):
@@ -305,7 +295,7 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
     """Columns of poses, by their names or in the order of the format."""
     if format in ("auto", "csv"):
-        if have_rotation(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
+        if by_name.have_rotation(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
             return meant
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
@@ -313,7 +303,7 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
-    frames = untimed(table)
+    frames = by_name.untimed(table)
     bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])
     if format == "auto" and bare:
         text = f"{table.name}: nothing says whether its quaternions are x, y, z, w or w, x, y, z"

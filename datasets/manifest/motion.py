@@ -334,26 +334,27 @@ class MotionReader:
             Both have times, but none in common; or not both have, and there is not one position for each pair.
         """
         self.warn(found.warnings)
-        if found.times is not None and self.sequence.times is not None:
+        clock, pairs = self.sequence.times, len(self.pairs)
+        if found.times is not None and clock is not None:
             times = tuple(t + section.time_offset for t in found.times)
-            refuse_apart(times, self.sequence.times, found.name)
+            refuse_apart(times, clock, found.name)
             return found.positions, times
-        rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
+        named = tuple(found.positions[row] for row in at.values())
+        if len(named) == pairs:
+            return named, None
         # Measurements may be of numbers of pairs.
-        numbers = tuple(map(float, range(len(self.pairs)))) if table == "positions" else None
-        clock = None if len(at) == len(self.pairs) else self.sequence.times or numbers
-        if at and (clock or len(at) == len(self.pairs)):
-            return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
-        of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
-        if of_images or len(rows) != len(self.pairs):
-            there = f"{len(at)} positions by names of left images" if of_images else f"{len(rows)} positions"
-            text = f"{table}.file: {section.file} has {there} for {len(self.pairs)} pairs"
-            remedy = (
-                "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
-            )
-            raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
-        return rows, None
+        clock = clock or (tuple(map(float, range(pairs))) if table == "positions" else None)
+        if named and clock:
+            return named, tuple(clock[k] for k in at)
+        rows = found.positions[:pairs] if self.growing else found.positions
+        of_images = bool(named) or any(name.lower().endswith(SUFFIXES) for name in found.images)
+        if len(rows) == pairs and not of_images:
+            return rows, None
+        there = f"{len(named)} positions by names of left images" if of_images else f"{len(rows)} positions"
+        text = f"{table}.file: {section.file} has {there} for {pairs} pairs, and not both have times"
+        remedy = "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
+        raise IncompleteError("RIL-803", text, remedy=remedy)
 
     def doubt_clock(self, section: Recorded, table: TextTable) -> None:
         """Warn of times since 1970 that are called GPS time, unless an offset is stated."""
