@@ -254,6 +254,16 @@ def _of_both_sides(groups: Sets) -> Sets:
     return both
 
 
+def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list[Path]]:
+    """Images by the one word in which the names of two cameras differ; empty if tokens tell more, or no word does."""
+    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
+    if any(min(map(len, sides)) > 1 for sides in both.values()):
+        return {}
+    parts = {word: [images[i] for i in of] for word, of in pairing.by_one_word(names).items()}
+    lefts = {path for left, _ in both.values() for path in left}
+    return {} if both and any(lefts <= set(of) for of in parts.values()) else parts
+
+
 def find_views(folder: Path, images: list[Path]) -> FoundImages:
     """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
 
@@ -265,13 +275,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
     groups = _by_token(images, names)
     both = _of_both_sides(groups)
-    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
-    parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
-    of_word = [[images[i] for i in of] for of in parts.values()]
-    lefts = {path for left, _ in both.values() for path in left}
-    if parts and not (both and any(lefts <= set(of) for of in of_word)):
+    if parts := _by_word(images, names, both):
         first, second = parts
-        both, tokens = {(0, ""): (of_word[0], of_word[1])}, ((first, second),)
+        both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
