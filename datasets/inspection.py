@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
-from rille.datasets.cameras.model import of_size
+from rille.datasets.cameras.model import of_size, relative_pose
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import located, sizes_of
@@ -429,12 +429,10 @@ def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[C
 
 
 def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> FoundCalibration:
-    poses = [camera.T_camera_reference for camera in cameras]
-    baseline = None
-    if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
-        baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    sizes = cameras[0].size, cameras[-1].size
-    return FoundCalibration(names, sizes, baseline, len(cameras), mount=cameras[0].mount)
+    left, right, number = cameras[0], cameras[-1], len(cameras)
+    pose = relative_pose(left, right) if number == 2 else None
+    baseline = None if pose is None else float(np.linalg.norm(pose.translation))
+    return FoundCalibration(names, (left.size, right.size), baseline, number, mount=left.mount)
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------

@@ -110,6 +110,13 @@ class Fields:
             raise self.error("RIL-114", key, f"is {_shown(value)}, it should hold entries of its own")
         return Fields(value, self.file, f"{self.at}{key}.", self.used)
 
+    def with_parts(self, prefixes: Mapping[str, str]) -> Fields:
+        """Entries with those of some nested parts among them, each behind the part's prefix."""
+        parts = {key: part for key in prefixes if isinstance(part := self.values.get(key), Mapping)}
+        flat = {f"{prefixes[key]}{name}": value for key, part in parts.items() for name, value in part.items()}
+        whole = {key: value for key, value in self.values.items() if key not in parts}
+        return Fields(whole | flat, self.file, self.at, self.used)
+
     def text(self, key: str, default: str | None = None) -> str:
         """A word; ``default`` if the key is missing."""
         if key not in self and default is not None:

@@ -168,9 +168,7 @@ GROUP = re.compile(r"(in|ex)trinsics?|camera|stereo|rig|calibration")
 
 def _flat(f: Fields) -> Fields:
     """Entries with those of the parts ``intrinsic``, ``extrinsic``, ``camera`` and the like among them."""
-    parts = {key: value for key, value in f.values.items() if GROUP.fullmatch(key) and isinstance(value, Mapping)}
-    flat = {key: value for part in parts.values() for key, value in part.items()}
-    return Fields({**{k: v for k, v in f.values.items() if k not in parts}, **flat}, f.file, f.at, f.used)
+    return f.with_parts({key: "" for key in f.values if GROUP.fullmatch(key)})
 
 
 def _parts(f: Fields) -> list[Fields]:
