@@ -16,7 +16,7 @@ from rille.datasets import protocol
 from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamps_of
-from rille.datasets.imu import at_frames, read_imu
+from rille.datasets.imu import at_frames, read_imu, sensed
 from rille.datasets.manifest.model import (
     Attitude,
     Imu,
@@ -403,20 +403,13 @@ class MotionReader:
 
     def imu(self, section: Imu) -> None:
         """Read rotations and vertical by an IMU."""
-        sequence = self.sequence
-        if sequence.times is None:
+        at = self.sequence.times
+        if at is None:
             text = "[imu] needs times, but the pairs have none"
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)
-        inertial = at_frames(shifted, sequence.times, section.T_imu_left)
-        self.state(
-            attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
-            up=inertial.up if any(inertial.up) else sequence.up,
-            imu_axes=inertial.axes,
-            notes=(*sequence.notes, *inertial.notes),
-            warnings=(*sequence.warnings, *inertial.warnings),
-        )
+        self.sequence = sensed(self.sequence, at_frames(shifted, at, section.T_imu_left))
 
 
 def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[int | None]:
