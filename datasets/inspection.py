@@ -12,7 +12,7 @@ import shlex
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise, takewhile
 from pathlib import Path
 
@@ -386,18 +386,14 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             continue
         if cameras:
             read[relative] = of_size(cameras, found.views.sizes)
-    candidates = [_calibration((name,), cameras) for name, cameras in read.items() if len(cameras) == 2]
-    for name, cameras in read.items():
-        if len(cameras) > 2:
-            chosen = _of_sides(cameras, found.views.sides)
-            names = (chosen[0].name, chosen[1].name)
-            candidates.append(replace(_calibration((name,), chosen), names=names))
+    # Of equally good files one of two cameras rather than one of more.
+    in_turn = sorted(read.items(), key=lambda item: len(item[1]) > 2)
+    candidates = [_calibration((name,), cameras, found.views.sides) for name, cameras in in_turn]
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     # Cameras of other names differ by the same words as their images.
     renamed = {name: _of_other_side(name, found.views.sides) for name in single}
     pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
-    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairs]
-    candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
+    candidates += [_calibration(pair, [single[name] for name in pair], found.views.sides) for pair in pairs]
     if candidates:
         place = Path(found.views.left).parent
 
@@ -420,19 +416,17 @@ def _of_other_side(name: str, sides: tuple[str, str]) -> str:
     return "".join(sides[1] if word == sides[0] else word for word in re.split(r"([^\W_]+)", name))
 
 
-def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
-    """The two of several cameras with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
+def _calibration(files: tuple[str, ...], cameras: list[CalibratedCamera], sides: tuple[str, str]) -> FoundCalibration:
+    """Of several cameras the two with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
     numbers = [re.search(r"\d+$", side) for side in sides]
     by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
     chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
-    return chosen if len(chosen) == 2 else cameras[:2]
-
-
-def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> FoundCalibration:
-    left, right, number = cameras[0], cameras[-1], len(cameras)
-    pose = relative_pose(left, right) if number == 2 else None
+    both = chosen if len(cameras) > 2 and len(chosen) == 2 else cameras[:2]
+    left, right = both[0], both[-1]
+    pose = relative_pose(left, right) if both[1:] else None
     baseline = None if pose is None else float(np.linalg.norm(pose.translation))
-    return FoundCalibration(names, (left.size, right.size), baseline, number, mount=left.mount)
+    names = (left.name, right.name) if len(cameras) > 2 else None
+    return FoundCalibration(files, (left.size, right.size), baseline, len(both), names, left.mount)
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -464,8 +458,7 @@ def table_kind(path: Path, pairs: int) -> str:
     table = of_poses(table)
     row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
-    words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
-    if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
+    if row.size >= 7 and (re.search("gyro|w_rs|ang_vel|angular|accel", header) or names_sensors(table)):
         return "imu"
     if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
@@ -480,14 +473,10 @@ def table_kind(path: Path, pairs: int) -> str:
     images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
     if images and "time" in meanings(table) and len(table.rows) == pairs:
         return "times"
-    # Names of images, dates and the like are no numbers.
-    return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
-
-
-def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
-    if (row.size == 1 and rows == pairs) or (row.size <= 3 and named):
+    if (row.size == 1 and len(table.rows) == pairs) or (row.size <= 3 and named):
         return "times"
-    return ""
+    # Names of images, dates and the like are no numbers.
+    return named if np.isinf(row).any() else ""
