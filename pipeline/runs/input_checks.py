@@ -395,16 +395,17 @@ def judge_sides(beyond: float) -> Finding:
     return judge("sides", f"{100 * beyond:.1f} % of the matches lie beyond infinity", {"beyond": beyond})
 
 
-def judge_pairs(unlike: Mapping[int, str], tested: int, exchanged: bool, names: Series[str]) -> Finding:
-    """Pairs, of those ``tested``, that do not fit the rig as the others do; ``unlike``: cause by frame; ``exchanged``:
-    whether the sides of most of them are."""
+def judge_pairs(unlike: Mapping[int, str], tested: int, swapped: int, names: Series[str]) -> Finding:
+    """Pairs, of those ``tested``, that do not fit the rig as the others do, some of them ``swapped``; ``unlike``: cause
+    by frame."""
     if not unlike:
         return judge(
             "sides", f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
         )
     first, why = next(iter(unlike.items()))
+    figure = "beyond" if 2 * swapped > tested else "unlike"
     text = f"{len(unlike)} of {tested} pairs over the sequence do not fit the rig, first frame {names[first]}: {why}"
-    return judge("sides", text, {"beyond" if exchanged else "unlike": len(unlike)})
+    return judge("sides", text, {figure: len(unlike)})
 
 
 def judge_epipolar(facts: Mapping[str, Any]) -> Finding:

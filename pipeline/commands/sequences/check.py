@@ -176,9 +176,9 @@ class Inspection:
         yield Maybe(list(tests.values()))
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)
-        exchanged = 2 * sum(one["swapped"] for one in facts.values()) > len(facts)
-        self.say(judge.judge_pairs(unlike, len(facts), exchanged, self.sequence.frame_names))
-        return next((pair for pair in tests if pair not in unlike), whole[0]), exchanged
+        swapped = sum(one["swapped"] for one in facts.values())
+        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
+        return next((pair for pair in tests if pair not in unlike), whole[0]), 2 * swapped > len(facts)
 
     def _first_pair(self, pair: int, exchanged: bool) -> Steps:
         """Match one pair, and compare it with the rig, which images of ``exchanged`` sides cannot fit."""
