@@ -55,8 +55,6 @@ class RigFacts(Facts):
     """Pairs whose rows the rig does not explain."""
     repeats: NotRequired[str]
     """What the images show repeats, so that matches may be off by a period."""
-    contradiction: NotRequired[str]
-    """A correction that no mount makes."""
     misread: NotRequired[str]
     """By which reading of the lenses' coefficients the matches fit better."""
     knocked: NotRequired[str]
@@ -80,4 +78,3 @@ class SynchronyFacts(Facts):
     """Spread of the rows of each pair, px."""
     partners: list[list[int]]
     """Left and right frame number, of pairs whose images are not of one time."""
-    contradiction: NotRequired[str]

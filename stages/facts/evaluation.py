@@ -1,7 +1,7 @@
 """Facts of the stages that compare results with the truth, or with another program's."""
 
 import math
-from typing import Any, NotRequired
+from typing import Any
 
 from rille.stages.core.declare import Facts
 
@@ -41,7 +41,6 @@ class MetricsFacts(Facts):
     """``metrics`` by name."""
 
     metrics: dict[str, Metric]
-    warnings: NotRequired[list[str]]
 
 
 class DriveCheckFacts(Facts):

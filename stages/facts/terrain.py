@@ -37,9 +37,6 @@ class GroundFacts(Facts):
     """Normal, in the left camera's frame, of a plane that most pixels lie on and that is no ground by its attitude."""
     why: NotRequired[str]
     """The reference is a plane that is no ground, though none was asked for."""
-    warnings: NotRequired[list[str]]
-    contradiction: NotRequired[str]
-    """Of the given vertical by the images."""
     seen_up: NotRequired[list[float]]
     """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
 
@@ -97,8 +94,6 @@ class AuditFacts(Facts):
     models: list[Json]
     seam_count: int
     seams: list[Json]
-    contradiction: NotRequired[str]
-    """Of most models by their neighbours."""
 
 
 class RadiometryFacts(Facts):
