@@ -32,16 +32,12 @@ class OrientationFacts(Facts):
     """Share of the matches that look as well elsewhere on their epipolar lines."""
 
 
-class RigFacts(Facts):
-    """The rig to be used; without a pair that can be used, the first six facts and ``warnings`` alone."""
+class RigFacts(CalibrationFacts):
+    """The rig to be used; without a pair that can be used, the facts that there always are and ``warnings`` alone."""
 
-    rig: dict[str, Any]
-    """To be used, as ``Rig.to_dict`` gives it."""
     given: dict[str, Any]
     mode: str
-    baseline: float
     source: str
-    changed: bool
     parameters: NotRequired[list[dict[str, Any]]]
     """Name, value, asked, sigma, unit, observed, freed, why; in mode ``fixed`` what would be changed."""
     per_pair: NotRequired[list[dict[str, Any]]]
