@@ -174,7 +174,7 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
     """Width and height; ``side``: 1 left, 2 right; ``rille calibrate`` writes both sizes if they differ."""
     for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
-            return f.pair_of_pixels(key)
+            return f.size(key)
     return f.size(f.spelt(WIDTHS), f.spelt(HEIGHTS))
 
 
