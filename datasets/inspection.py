@@ -132,21 +132,21 @@ def inspect(folder: Path) -> Findings:
         remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
         raise InputError("RIL-193", f"{folder} is no folder", remedy=remedy)
     search = Search()
-    there = _files(folder, search)
-    paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
-    for path in paths:
-        writable(_relative(path, folder))
-    strange = [UNWRITABLE.sub("?", _relative(p, folder)) for p in there if p not in set(paths)]
+    there = {path: _relative(path, folder) for path in _files(folder, search)}
+    images, texts = ([p for p in there if p.suffix.lower() in of] for of in (SUFFIXES, (*CALIBRATIONS, *TABLES)))
+    known = {*images, *texts}
+    for path in (p for p in there if p in known):
+        writable(there[path])
+    strange = [UNWRITABLE.sub("?", name) for path, name in there.items() if path not in known]
     try:
-        found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
+        found = Findings(folder, find_views(folder, images))
     except InputError as error:
         text, lines = "; ".join([error.message, *search.closed[:1]]), unread(strange)
-        if any(map(hints, strange)) and not any(p.suffix.lower() in SUFFIXES for p in paths):
+        if any(map(hints, strange)) and not images:
             raise InputError(error.code, text, remedy="; ".join(lines)) from error
         raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
     found.unread += [*found.views.others, *_places_in_images(found.views.left, folder, search)]
-    texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
@@ -155,8 +155,7 @@ def inspect(folder: Path) -> Findings:
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
     used |= {name.replace("intrinsic", "extrinsic") for name in used}  # OpenCV's pair of files
     for path in texts:
-        relative = _relative(path, folder)
-        if path.suffix.lower() not in TABLES or relative in used or any(str(path) in line for line in found.unread):
+        if path.suffix.lower() not in TABLES or there[path] in used or any(str(path) in line for line in found.unread):
             continue
         try:
             kind = table_kind(path, found.views.pairs)
@@ -164,10 +163,10 @@ def inspect(folder: Path) -> Findings:
             found.unread += [] if str(error) in found.unread else [str(error)]
             continue
         if kind:
-            found.tables.setdefault(kind, []).append(relative)
-            used.add(relative)
+            found.tables.setdefault(kind, []).append(there[path])
+            used.add(there[path])
     told = " ".join(found.unread)
-    unknown = [_relative(p, folder) for p in texts if _relative(p, folder) not in used and str(p) not in told]
+    unknown = [there[p] for p in texts if there[p] not in used and str(p) not in told]
     cameras = [name for name in unknown if _of_cameras(folder / name)]
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
