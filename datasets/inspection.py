@@ -442,11 +442,9 @@ def table_kind(path: Path, pairs: int) -> str:
     """
     # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
-        raise InputError(
-            "RIL-976",
-            f"{path} holds poses by COLMAP, at a scale that it need not know",
-            remedy='if they are in metres, state them as [truth] with file = "images.txt"',
-        )
+        text = f"{path} holds poses by COLMAP, at a scale that it need not know"
+        remedy = 'if they are in metres, state them as [truth] with file = "images.txt"'
+        raise InputError("RIL-976", text, remedy=remedy)
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")

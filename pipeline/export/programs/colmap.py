@@ -112,13 +112,10 @@ def build(
         ours.rig_from_world = pycolmap.Rigid3d(np.array(T_world_left.inverse().matrix34))
         model.add_frame(ours)
         for side, camera in cameras.items():
-            image = pycolmap.Image(
-                # COLMAP's text files end a name at a blank.
-                name=f"{side}/{names.get(frame, f'{frame:06d}.png')}".replace(" ", "_"),
-                keypoints=np.array(seen[frame, side]).reshape(-1, 2),
-                camera_id=camera.camera_id,
-                image_id=number[frame, side],
-            )
+            # COLMAP's text files end a name at a blank.
+            name = f"{side}/{names.get(frame, f'{frame:06d}.png')}".replace(" ", "_")
+            pixels, at = np.array(seen[frame, side]).reshape(-1, 2), number[frame, side]
+            image = pycolmap.Image(name=name, keypoints=pixels, camera_id=camera.camera_id, image_id=at)
             image.frame_id = k
             model.add_image(image)
     for position, elements, colour in points:
