@@ -209,9 +209,9 @@ def _joined(
     left, right = sorted(taken[0]), sorted(taken[1])
     joined = join([stamp / 1e9 for stamp in left], [stamp / 1e9 for stamp in right], tolerance)
     if not joined.places:
+        near = f"the nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed"
         text = (
-            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); the "
-            f"nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed"
+            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); {near}"
         )
         raise InputError("RIL-947", text, remedy="synchronise the cameras, or state images.tolerance (s) in a manifest")
     both = [left[i] for i, _ in joined.places], [right[j] for _, j in joined.places]

@@ -413,10 +413,8 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
     if "residual_before_px" not in facts:
         return judge("epipolar", str(facts.get("words", "not checked")), {"known": 0})
     before, after, offset = (float(facts[name]) for name in ("residual_before_px", "residual_after_px", "row_offset"))
-    words = (
-        f"off the epipolar lines {offset:+.2f} px, roll {float(facts['roll_deg']):+.3f} degrees, "
-        f"residual {before:.2f} px RMS, adjusted {after:.2f}"
-    )
+    words = f"off the epipolar lines {offset:+.2f} px, roll {float(facts['roll_deg']):+.3f} degrees"
+    words = f"{words}, residual {before:.2f} px RMS, adjusted {after:.2f}"
     turn = float(facts["turn_deg"])
     if abs(turn) > MAX_IMAGE_TURN_DEG:
         words = f"the right image is turned by {abs(turn):.0f} degrees against the left one; {words}"
@@ -457,8 +455,6 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
     overlap = {k: float(m["overlap"] or 0.0) for k, m in motions.items()}
     length = [float(m["median_length"]) for m in motions.values() if m["median_length"] is not None]
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
-    text = (
-        f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} % "
-        f"from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
-    )
+    text = f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} %"
+    text += f" from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
     return judge("motion", text, {"overlap": least, **({"largest motion, px": max(length)} if length else {})})

@@ -55,10 +55,8 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     model = build(rig, run.one("trajectory", last=True), names, segments, images)
     folder.mkdir()
     model.write_text(str(folder))
-    return (
-        f"{model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
-        f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
-    )
+    points = f"{model.num_points3D()} points, {model.compute_mean_reprojection_error():.2f} px"
+    return f"{model.num_reg_frames()} frames of 2 images, {points}; open it with colmap gui --import_path"
 
 
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
