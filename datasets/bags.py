@@ -210,10 +210,9 @@ def _joined(
     joined = join([stamp / 1e9 for stamp in left], [stamp / 1e9 for stamp in right], tolerance)
     if not joined.places:
         near = f"the nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed"
-        text = (
-            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); {near}"
-        )
-        raise InputError("RIL-947", text, remedy="synchronise the cameras, or state images.tolerance (s) in a manifest")
+        text = f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)})"
+        remedy = "synchronise the cameras, or state images.tolerance (s) in a manifest"
+        raise InputError("RIL-947", f"{text}; {near}", remedy=remedy)
     both = [left[i] for i, _ in joined.places], [right[j] for _, j in joined.places]
     lines = joined.lines("RIL-948")
     for topic, of in zip(topics, taken, strict=True):

@@ -138,9 +138,8 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
         f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
         camera = f.optics("fx fy ppx ppy", f.size("width", "height"), "none").camera
         pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
-        cameras[number, camera.width, camera.height] = CalibratedCamera(
-            f"Infrared {number}", f.distorted("coeffs", camera), pose
-        )
+        name, lens = f"Infrared {number}", f.distorted("coeffs", camera)
+        cameras[number, camera.width, camera.height] = CalibratedCamera(name, lens, pose)
     return list(cameras.values())
 
 

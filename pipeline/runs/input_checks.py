@@ -399,9 +399,8 @@ def judge_pairs(unlike: Mapping[int, str], tested: int, swapped: int, names: Ser
     """Pairs, of those ``tested``, that do not fit the rig as the others do, some of them ``swapped``; ``unlike``: cause
     by frame."""
     if not unlike:
-        return judge(
-            "sides", f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
-        )
+        text = f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
+        return judge("sides", text)
     first, why = next(iter(unlike.items()))
     figure = "beyond" if 2 * swapped > tested else "unlike"
     text = f"{len(unlike)} of {tested} pairs over the sequence do not fit the rig, first frame {names[first]}: {why}"

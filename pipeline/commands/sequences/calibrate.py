@@ -173,12 +173,10 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
     # hundredths; at any resolution and distance.
     if rig.rms > 0.1 * spacing:
-        text = (
-            f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS, {spacing:.0f} px apart"
-        )
-        doubt = "no flat board, or not the same moment left and right"
+        text = f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS"
+        doubt = f"{spacing:.0f} px apart: no flat board, or not the same moment left and right"
         remedy = "give pictures of a chessboard, and its inner corners, e.g. --corners 9x6"
-        raise InputError("RIL-800", f"{text}: {doubt}", remedy=remedy)
+        raise InputError("RIL-800", f"{text}, {doubt}", remedy=remedy)
 
 
 def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:
