@@ -27,7 +27,7 @@ from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import Header, sizes_of
 from rille.datasets.images.pairing import join, two_sides
-from rille.datasets.imu import ImuRecord, Inertial, at_frames
+from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
 from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
 from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
@@ -114,7 +114,6 @@ def open_bag(
         frame = taken["left"][0].frame
         optics, turned = (optics_of(sizes), np.eye(3)) if optics_of else _optics(reader, path, chosen, sizes)
         inertial, odometry, unused = _movement(reader, path, times, frame, turned)
-    up = inertial.up if any(inertial.up) else None
 
     def image(number: int, camera: str) -> Source:
         one = taken[camera][number]
@@ -122,7 +121,7 @@ def open_bag(
         place = bag.Message(str(path), chosen[CAMERAS.index(camera)], one.at)
         return Source("rille.datasets.images.bag", NoParams(), args, hints={"message": place._asdict()})
 
-    return Sequence(
+    sequence = Sequence(
         name=derived_name(path.stem),
         rig=optics.rig,
         frames=len(stamps),
@@ -130,14 +129,12 @@ def open_bag(
         frame_names=tuple(map(str, stamps)),
         lenses=optics.lenses,
         times=times,
-        up=up if optics.up is None else (optics.up,) * len(stamps),
-        attitude=inertial.attitude if any(inertial.attitude) else None,
-        imu_axes=inertial.axes,
         odometry=odometry,
         defaults=STREET if optics.rig.baseline >= CAR else {},
-        notes=inertial.notes,
-        warnings=(*warnings, *optics.warnings, *unused, *inertial.warnings),
+        warnings=(*warnings, *optics.warnings, *unused),
     )
+    sequence = sensed(sequence, inertial)
+    return sequence if optics.up is None else replace(sequence, up=(optics.up,) * len(stamps))
 
 
 # -- images ------------------------------------------------------------------------------------------------------------
@@ -212,11 +209,10 @@ def _joined(
     left, right = sorted(taken[0]), sorted(taken[1])
     joined = join([stamp / 1e9 for stamp in left], [stamp / 1e9 for stamp in right], tolerance)
     if not joined.places:
-        text = (
-            f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)}); the "
-            f"nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed"
-        )
-        raise InputError("RIL-947", text, remedy="synchronise the cameras, or state images.tolerance (s) in a manifest")
+        near = f"the nearest are {1e3 * joined.apart:.4g} ms apart, {1e3 * joined.allowed:.3g} ms are allowed"
+        text = f"{path}: no image of {topics[0]} ({len(left)}) has the stamp of one of {topics[1]} ({len(right)})"
+        remedy = "synchronise the cameras, or state images.tolerance (s) in a manifest"
+        raise InputError("RIL-947", f"{text}; {near}", remedy=remedy)
     both = [left[i] for i, _ in joined.places], [right[j] for _, j in joined.places]
     lines = joined.lines("RIL-948")
     for topic, of in zip(topics, taken, strict=True):

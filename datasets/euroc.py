@@ -11,7 +11,6 @@ unaccelerated, the vertical; both are optional start values.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,15 +25,11 @@ from rille.datasets.text.names import derived_name
 from rille.stages.core.errors import InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 
-TRUTH: Mapping[str, bool] = {
-    "state_groundtruth_estimate0": True,
-    "gt": True,
-    "mocap0": True,
-    "vicon0": False,
-    "leica0": False,
-}
-"""Folders of true poses (the last: positions), the best first, and whether they are the body's if no ``T_BS`` is
-stated."""
+OF_BODY = ("state_groundtruth_estimate0", "gt", "mocap0")
+"""Folders of true poses, the best first, which are the body's if no ``T_BS`` is stated."""
+
+TRUTH = (*OF_BODY, "vicon0", "leica0")
+"""All folders of true poses (the last: positions), the best first."""
 
 IMU = "imu0"
 """Folder of the IMU."""
@@ -93,7 +88,7 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
     recorded = [name for name in (*TRUTH, IMU) if (folder / name / "data.csv").is_file()]
     best = next((name for name in recorded if name in TRUTH), None)
     for name in (name for name in recorded if name in (best, IMU)):
-        T_body_sensor = body_pose(folder / name) or (RigidTransform.identity() if TRUTH.get(name) else None)
+        T_body_sensor = body_pose(folder / name) or (RigidTransform.identity() if name in OF_BODY else None)
         if T_body_sensor is None:
             text = f"{folder / name} does not say how it stands in the body (T_BS): it is not used"
             warnings.append(warning("RIL-683", text))

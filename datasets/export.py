@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from rille.stages.geometry.geometry import Camera, RigidTransform, level_rotatio
 from rille.stages.geometry.lattice import Lattice
 
 Materialise = Callable[[Source], Bundle]
+
+EXACT = "%.17g"
+"""Format of numbers: 17 digits keep every float64 to the bit."""
 
 README = "export_readme.txt"
 """File beside this module: text of the folder's readme, with fields for the sequence's name, size and notes."""
@@ -47,9 +50,10 @@ def export(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
     if sequence.truth is not None:
         poses = (sequence.truth[k] for k in frames)
         # Twelve numbers, rows of [R | t]; NaN for a gap.
-        _write_rows(folder / "poses.txt", [[math.nan] * 12 if pose is None else pose.to_list() for pose in poses])
+        rows = [[math.nan] * 12 if pose is None else pose.to_list() for pose in poses]
+        np.savetxt(folder / "poses.txt", rows, EXACT)
     if sequence.times is not None:
-        _write_rows(folder / "times.txt", [[sequence.times[k]] for k in frames])
+        np.savetxt(folder / "times.txt", [sequence.times[k] for k in frames], EXACT)
     basic = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in sorted({*basic} - {*sequence.lost}):
         if sequence.truth_disparity is not None:
@@ -79,11 +83,6 @@ def _write_png(path: Path, image: Any) -> None:
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
-def _write_rows(path: Path, rows: Iterable[Iterable[float]]) -> None:
-    # 17 digits keep every float64 to the bit.
-    path.write_text("".join(" ".join(f"{v:.17g}" for v in row) + "\n" for row in rows), encoding="utf-8")
-
-
 def projection(camera: Camera, T_camera_reference: RigidTransform) -> list[float]:
     """Twelve numbers of P = K [R | t], row-major."""
     return [float(v) for v in (camera.matrix @ T_camera_reference.matrix34).reshape(-1)]
@@ -93,7 +92,7 @@ def _write_rig(sequence: Sequence, folder: Path) -> None:
     rig = sequence.rig
     (folder / "rig.json").write_text(json.dumps(rig.to_dict(), indent=1) + "\n", encoding="utf-8")
     rows = [projection(rig.left, RigidTransform.identity()), projection(rig.right, rig.T_right_left)]
-    _write_rows(folder / "calib.txt", rows)
+    np.savetxt(folder / "calib.txt", rows, EXACT)
 
 
 def _write_disparity(folder: Path, name: str, truth: Bundle) -> None:

@@ -1,17 +1,24 @@
-"""Georeference of a sequence's world frame on Earth or another body: a projected CRS, an origin and a heading."""
+"""Places on Earth or another body: the georeference of a sequence's world frame, and tables of places.
+
+A georeference is a projected CRS, an origin and a heading.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rille.datasets.text.columns import POSITION, geocentric, have_rotation, meanings
+from rille.datasets.text.tables import TextTable
+from rille.datasets.text.units import unitless
 from rille.stages.core.arrays import Floats
+from rille.stages.core.errors import InputError
 
 EARTH_RADIUS = 6_371_008.8
 """m; its mean: the ellipsoid departs from it by .5 %."""
@@ -113,3 +120,60 @@ def metric_crs(text: str) -> str:
     if factor != 1.0:
         raise ValueError(f"it is in {unit} of {factor:.6g} m: give one in metres")
     return text
+
+
+def projected(table: TextTable, crs: str) -> TextTable:
+    """The table with easting and northing, m, in the columns of longitude and latitude, or of coordinates from the
+    Earth's centre, whose third has the height above the ellipsoid.
+
+    In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
+    have NaN there. Unchanged if no row has such coordinates, or columns of metres stand beside degrees.
+
+    Raises
+    ------
+    InputError
+        A place lies where ``crs`` has none.
+    """
+    meant = meanings(table)
+    from_centre = _from_centre(table, meant)
+    degrees = meant.keys() >= {"lat", "lon"} and not meant.keys() >= {"x", "y"}
+    at = from_centre or ([meant["lon"], meant["lat"]] if degrees else [])
+    if not at:
+        return table
+    from rasterio import warp
+
+    transform: Any = warp.transform
+    places = table.values(at)
+    there = np.asarray(np.isfinite(places).all(axis=1) & places.any(axis=1))
+    if from_centre:
+        places[there] = np.transpose(transform("EPSG:4978", "EPSG:4979", *places[there].T))
+    there &= (np.abs(places[:, :2]) <= (180, 90)).all(axis=1)
+    if not there.any():
+        return table
+    longitude, latitude = places[there][0, :2]
+    crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
+    places[~there] = np.nan
+    try:
+        places[there, :2] = np.transpose(transform("OGC:CRS84", crs, *places[there, :2].T))
+    except Exception as error:  # GDAL's have no public class
+        raise InputError("RIL-776", f"{table.name} has places beyond {crs}", remedy="correct or remove them") from error
+    cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
+    rows = tuple(tuple((dict(enumerate(row)) | of).values()) for row, of in zip(table.rows, cells, strict=True))
+    header = tuple(unitless(name) if k in at else name for k, name in enumerate(table.header))
+    return replace(table, rows=rows, header=header, crs=crs)
+
+
+def _from_centre(table: TextTable, meant: Mapping[str, int]) -> list[int]:
+    """Columns x, y and z of positions from the Earth's centre, by their names, or their distance alone; empty: none."""
+    named = geocentric(table)
+    columns = named if named.keys() >= set(POSITION) else meant
+    if "lat" in meant or not columns.keys() >= set(POSITION) or have_rotation(meant):
+        return []
+    at = [columns[axis] for axis in POSITION]
+    places = table.values(at)
+    places = places[np.isfinite(places).all(axis=1) & places.any(axis=1)]
+    # .006: the ground departs from the mean radius by .5 %.
+    on_ground = np.abs(np.linalg.norm(places, axis=1) / EARTH_RADIUS - 1.0) < 0.006
+    # A northing may be as large, but no height is 100 km.
+    on_earth = on_ground & (bool(named) | (np.abs(places[:, 2]) > 1e5))
+    return at if len(places) and on_earth.all() else []

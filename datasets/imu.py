@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.poses import coverage, meanings, refuse_apart, times_of
+from rille.datasets import protocol
+from rille.datasets.poses import coverage, refuse_apart, times_of
 from rille.datasets.protocol import Rows, Vector, rows_of, vector_of
+from rille.datasets.text.columns import meanings
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES, unitless
 from rille.stages.core.arrays import Bools, Floats
@@ -245,6 +247,18 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         up.append(None if seen is None else vector_of(seen / np.linalg.norm(seen)))
     warnings = (*imu.warnings, *coverage(attitude, at, f"attitude from {imu.name}"))
     return Inertial(tuple(attitude), tuple(up), rows_of(R_imu_left), warnings, notes)
+
+
+def sensed(sequence: protocol.Sequence, inertial: Inertial) -> protocol.Sequence:
+    """The sequence with the attitude and the vertical of an IMU, as far as they are known."""
+    return replace(
+        sequence,
+        attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
+        up=inertial.up if any(inertial.up) else sequence.up,
+        imu_axes=inertial.axes,
+        notes=(*sequence.notes, *inertial.notes),
+        warnings=(*sequence.warnings, *inertial.warnings),
+    )
 
 
 def stretches(imu: ImuRecord, bias: Floats | None, start: float, end: float) -> list[Stretch]:

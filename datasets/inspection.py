@@ -12,30 +12,22 @@ import shlex
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
 
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
-from rille.datasets.cameras.model import of_size
+from rille.datasets.cameras.model import of_size, relative_pose
 from rille.datasets.images import pairing
 from rille.datasets.images.files import SUFFIXES, common_header
 from rille.datasets.images.headers import located, sizes_of
 from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import (
-    QUATERNION,
-    matrix_at,
-    meanings,
-    of_images,
-    of_photographs,
-    of_poses,
-    positions_of,
-    untimed,
-)
+from rille.datasets.poses import of_images, of_poses, positions_of
+from rille.datasets.text.columns import QUATERNION, matrix_at, meanings, of_photographs, untimed
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -140,21 +132,21 @@ def inspect(folder: Path) -> Findings:
         remedy = "; ".join([*hints(str(folder)), "name a folder that holds images of two cameras"])
         raise InputError("RIL-193", f"{folder} is no folder", remedy=remedy)
     search = Search()
-    there = _files(folder, search)
-    paths = [p for p in there if p.suffix.lower() in (*SUFFIXES, *CALIBRATIONS, *TABLES)]
-    for path in paths:
-        writable(_relative(path, folder))
-    strange = [UNWRITABLE.sub("?", _relative(p, folder)) for p in there if p not in set(paths)]
+    there = {path: _relative(path, folder) for path in _files(folder, search)}
+    images, texts = ([p for p in there if p.suffix.lower() in of] for of in (SUFFIXES, (*CALIBRATIONS, *TABLES)))
+    known = {*images, *texts}
+    for path in (p for p in there if p in known):
+        writable(there[path])
+    strange = [UNWRITABLE.sub("?", name) for path, name in there.items() if path not in known]
     try:
-        found = Findings(folder, find_views(folder, [p for p in paths if p.suffix.lower() in SUFFIXES]))
+        found = Findings(folder, find_views(folder, images))
     except InputError as error:
         text, lines = "; ".join([error.message, *search.closed[:1]]), unread(strange)
-        if any(map(hints, strange)) and not any(p.suffix.lower() in SUFFIXES for p in paths):
+        if any(map(hints, strange)) and not images:
             raise InputError(error.code, text, remedy="; ".join(lines)) from error
         raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
     found.unread += [*found.views.others, *_places_in_images(found.views.left, folder, search)]
-    texts = [p for p in paths if p.suffix.lower() in (*CALIBRATIONS, *TABLES)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
@@ -163,8 +155,7 @@ def inspect(folder: Path) -> Findings:
     used = set(found.calibration.files if found.calibration else ()) | set(found.others)
     used |= {name.replace("intrinsic", "extrinsic") for name in used}  # OpenCV's pair of files
     for path in texts:
-        relative = _relative(path, folder)
-        if path.suffix.lower() not in TABLES or relative in used or any(str(path) in line for line in found.unread):
+        if path.suffix.lower() not in TABLES or there[path] in used or any(str(path) in line for line in found.unread):
             continue
         try:
             kind = table_kind(path, found.views.pairs)
@@ -172,10 +163,10 @@ def inspect(folder: Path) -> Findings:
             found.unread += [] if str(error) in found.unread else [str(error)]
             continue
         if kind:
-            found.tables.setdefault(kind, []).append(relative)
-            used.add(relative)
+            found.tables.setdefault(kind, []).append(there[path])
+            used.add(there[path])
     told = " ".join(found.unread)
-    unknown = [_relative(p, folder) for p in texts if _relative(p, folder) not in used and str(p) not in told]
+    unknown = [there[p] for p in texts if there[p] not in used and str(p) not in told]
     cameras = [name for name in unknown if _of_cameras(folder / name)]
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
@@ -262,6 +253,16 @@ def _of_both_sides(groups: Sets) -> Sets:
     return both
 
 
+def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list[Path]]:
+    """Images by the one word in which the names of two cameras differ; empty if tokens tell more, or no word does."""
+    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
+    if any(min(map(len, sides)) > 1 for sides in both.values()):
+        return {}
+    parts = {word: [images[i] for i in of] for word, of in pairing.by_one_word(names).items()}
+    lefts = {path for left, _ in both.values() for path in left}
+    return {} if both and any(lefts <= set(of) for of in parts.values()) else parts
+
+
 def find_views(folder: Path, images: list[Path]) -> FoundImages:
     """The two sets of images, by the tokens in their names that make most pairs; else by the word in which they differ.
 
@@ -273,13 +274,9 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
     groups = _by_token(images, names)
     both = _of_both_sides(groups)
-    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
-    parts = pairing.by_one_word(names) if all(min(map(len, sides)) == 1 for sides in both.values()) else {}
-    of_word = [[images[i] for i in of] for of in parts.values()]
-    lefts = {path for left, _ in both.values() for path in left}
-    if parts and not (both and any(lefts <= set(of) for of in of_word)):
+    if parts := _by_word(images, names, both):
         first, second = parts
-        both, tokens = {(0, ""): (of_word[0], of_word[1])}, ((first, second),)
+        both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
@@ -388,18 +385,14 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             continue
         if cameras:
             read[relative] = of_size(cameras, found.views.sizes)
-    candidates = [_calibration((name,), cameras) for name, cameras in read.items() if len(cameras) == 2]
-    for name, cameras in read.items():
-        if len(cameras) > 2:
-            chosen = _of_sides(cameras, found.views.sides)
-            names = (chosen[0].name, chosen[1].name)
-            candidates.append(replace(_calibration((name,), chosen), names=names))
+    # Of equally good files one of two cameras rather than one of more.
+    in_turn = sorted(read.items(), key=lambda item: len(item[1]) > 2)
+    candidates = [_calibration((name,), cameras, found.views.sides) for name, cameras in in_turn]
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     # Cameras of other names differ by the same words as their images.
     renamed = {name: _of_other_side(name, found.views.sides) for name in single}
     pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
-    candidates += [_calibration(pair, [single[name] for name in pair]) for pair in pairs]
-    candidates += [_calibration((name,), [camera]) for name, camera in single.items()]
+    candidates += [_calibration(pair, [single[name] for name in pair], found.views.sides) for pair in pairs]
     if candidates:
         place = Path(found.views.left).parent
 
@@ -422,21 +415,17 @@ def _of_other_side(name: str, sides: tuple[str, str]) -> str:
     return "".join(sides[1] if word == sides[0] else word for word in re.split(r"([^\W_]+)", name))
 
 
-def _of_sides(cameras: list[CalibratedCamera], sides: tuple[str, str]) -> list[CalibratedCamera]:
-    """The two of several cameras with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
+def _calibration(files: tuple[str, ...], cameras: list[CalibratedCamera], sides: tuple[str, str]) -> FoundCalibration:
+    """Of several cameras the two with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
     numbers = [re.search(r"\d+$", side) for side in sides]
     by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
     chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
-    return chosen if len(chosen) == 2 else cameras[:2]
-
-
-def _calibration(names: tuple[str, ...], cameras: list[CalibratedCamera]) -> FoundCalibration:
-    poses = [camera.T_camera_reference for camera in cameras]
-    baseline = None
-    if len(poses) == 2 and poses[0] is not None and poses[1] is not None:
-        baseline = float(np.linalg.norm((poses[1] @ poses[0].inverse()).translation))
-    sizes = cameras[0].size, cameras[-1].size
-    return FoundCalibration(names, sizes, baseline, len(cameras), mount=cameras[0].mount)
+    both = chosen if len(cameras) > 2 and len(chosen) == 2 else cameras[:2]
+    left, right = both[0], both[-1]
+    pose = relative_pose(left, right) if both[1:] else None
+    baseline = None if pose is None else float(np.linalg.norm(pose.translation))
+    names = (left.name, right.name) if len(cameras) > 2 else None
+    return FoundCalibration(files, (left.size, right.size), baseline, len(both), names, left.mount)
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -453,11 +442,9 @@ def table_kind(path: Path, pairs: int) -> str:
     """
     # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
-        raise InputError(
-            "RIL-976",
-            f"{path} holds poses by COLMAP, at a scale that it need not know",
-            remedy='if they are in metres, state them as [truth] with file = "images.txt"',
-        )
+        text = f"{path} holds poses by COLMAP, at a scale that it need not know"
+        remedy = 'if they are in metres, state them as [truth] with file = "images.txt"'
+        raise InputError("RIL-976", text, remedy=remedy)
     named = "times" if "time" in path.stem.lower() else ""
     try:
         table = read_table(path, "table")
@@ -468,8 +455,7 @@ def table_kind(path: Path, pairs: int) -> str:
     table = of_poses(table)
     row = table.values(range(table.columns))[0]
     header = " ".join(table.header)
-    words = ("gyro", "w_rs", "ang_vel", "angular", "accel")
-    if (any(word in header for word in words) or names_sensors(table)) and row.size >= 7:
+    if row.size >= 7 and (re.search("gyro|w_rs|ang_vel|angular|accel", header) or names_sensors(table)):
         return "imu"
     if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
@@ -484,14 +470,10 @@ def table_kind(path: Path, pairs: int) -> str:
     images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
     if images and "time" in meanings(table) and len(table.rows) == pairs:
         return "times"
-    # Names of images, dates and the like are no numbers.
-    return _kind_of_row(row, len(table.rows), pairs, named) or (named if np.isinf(row).any() else "")
-
-
-def _kind_of_row(row: np.ndarray, rows: int, pairs: int, named: str) -> str:
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
-    if (row.size == 1 and rows == pairs) or (row.size <= 3 and named):
+    if (row.size == 1 and len(table.rows) == pairs) or (row.size <= 3 and named):
         return "times"
-    return ""
+    # Names of images, dates and the like are no numbers.
+    return named if np.isinf(row).any() else ""

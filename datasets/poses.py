@@ -21,15 +21,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rille.datasets.georeference import projected
 from rille.datasets.images.files import SUFFIXES
+from rille.datasets.text import columns as by_name
 from rille.datasets.text import units
+from rille.datasets.text.columns import ANGLES, POSITION, QUATERNION, UNTIMED, meanings, stated_column
 from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.times import UNITS, of_two, seconds
@@ -39,11 +42,7 @@ from rille.stages.core.declare import AnyArray
 from rille.stages.core.errors import InputError, warning, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
 
-QUATERNION, POSITION, ANGLES = ("qw", "qx", "qy", "qz"), ("x", "y", "z"), ("roll", "pitch", "yaw")
-ORDERED: Mapping[str, tuple[str, ...]] = {
-    "tum": ("time", *POSITION, "qx", "qy", "qz", "qw"),
-    "euroc": ("time", *POSITION, *QUATERNION),
-}
+ORDERED: Mapping[str, tuple[str, ...]] = {"tum": ("time", *UNTIMED), "euroc": ("time", *POSITION, *QUATERNION)}
 
 IMAGES = ("image", *QUATERNION, *POSITION, "camera", "name")
 IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
@@ -58,57 +57,14 @@ MIN_ROUNDED = 4
 WITHIN = 1e-6
 """s; times that differ by less are equal."""
 
-WORDS = (
-    (
-        re.compile(
-            r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?"
-        ),
-        lambda m: "time",
-    ),
-    # ROS tools write the path of a field before its name.
-    (re.compile(r"(.*[./])?(q|r|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])"), lambda m: "q" + m[3]),
-    (re.compile(r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])"), lambda m: m[1]),
-    (re.compile(r"(?:.*[./])?(?:position|translation)[./]([xyz])"), lambda m: m[1]),
-    (re.compile(r"(roll|pitch|yaw)"), lambda m: m[1]),
-    (re.compile(r"theta"), lambda m: "yaw"),
-    # RTKLIB has baselines from the reference station, Metashape X/Easting, PlotJuggler /fix/altitude.
-    (re.compile(r"(?:utm[_. ]?|.*/)?(?:e|east|easting)(?:-baseline)?"), lambda m: "x"),
-    (re.compile(r"(?:utm[_. ]?|.*/)?(?:n|north|northing)(?:-baseline)?"), lambda m: "y"),
-    # Gauss-Krueger's names, and EXIF's.
-    (re.compile(r"rechtswert"), lambda m: "x"),
-    (re.compile(r"hochwert"), lambda m: "y"),
-    (re.compile(r"h|hoehe|h\N{LATIN SMALL LETTER O WITH DIAERESIS}he|elev"), lambda m: "z"),
-    (
-        re.compile(
-            r"(?:.*[./]|(?:gps|gnss|wgs84|utm)[_ ]?)?(?:up|u-baseline|height|alt|altitude|elevation|down|depth)"
-        ),
-        lambda m: "z",
-    ),
-    (re.compile(r"(?:.*[./_ ]|gps)?lat(?:itude)?"), lambda m: "lat"),
-    (re.compile(r"(?:.*[./_ ]|gps)?(?:lng|long?(?:itude)?)"), lambda m: "lon"),
-)
+NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
+"""Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
 DOWNWARDS = re.compile(r"(.*[./])?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
-
 # Names of columns that are 0 if a GNSS receiver has no position, unlike a status, which is 0 if it has one.
 FIX = re.compile(r"q|fix|(?:gps|fix|gnss)?[_. ]?qual(?:ity)?|fix[_. ]?type")
-
-NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
-"""Part of names of columns in degrees, and of coordinates from the Earth's centre."""
-
-ECEF = re.compile(r"(?:.*[./_ ])?(?:ecef[-_. ]?([xyz])|([xyz])[-_. ]?ecef)")
-"""Names of columns of coordinates from the Earth's centre."""
-
-EARTH = (6.33e6, 6.40e6)
-"""m; distances of the ground from the Earth's centre."""
-
-ROTATION = re.compile(
-    r"(.*[./_ ])?(rot|rvec|quat|orient|roll|pitch|yaw|heading|theta|omega|phi|kappa|euler|rodrig|axis_?angle).*"
-    r"|(r|q|rv)_?[wxyz]|[rm]_?\d_?\d"
-)
-"""Names of columns of rotations of any kind."""
 
 NANOSECONDS = re.compile(r"(.*[./_])?n(ano)?sec(s|onds)?")
 """Name of a column after that of the whole seconds, as in stamps of ROS messages."""
@@ -155,61 +111,6 @@ def of_poses(table: TextTable, crs: str = "") -> TextTable:
     return projected(table, crs)
 
 
-def projected(table: TextTable, crs: str) -> TextTable:
-    """The table with easting and northing, m, in the columns of longitude and latitude, or of coordinates from the
-    Earth's centre, whose third has the height above the ellipsoid.
-
-    In ``crs``, or, if that is empty, in the UTM zone of its first place. Rows without a place (no number, or 0 and 0)
-    have NaN there. Unchanged if no row has such coordinates, or columns of metres stand beside degrees.
-
-    Raises
-    ------
-    InputError
-        A place lies where ``crs`` has none.
-    """
-    meant = meanings(table)
-    at = _from_centre(table, meant)
-    if not at and (not meant.keys() >= {"lat", "lon"} or meant.keys() >= {"x", "y"}):
-        return table
-    from rasterio import warp
-
-    transform: Any = warp.transform
-    of_earth = table.values(at or [meant["lon"], meant["lat"]])
-    there = np.asarray(np.isfinite(of_earth).all(axis=1) & of_earth.any(axis=1))
-    if at:
-        of_earth[there] = np.transpose(transform("EPSG:4978", "EPSG:4979", *of_earth[there].T))
-    at = at or [meant["lon"], meant["lat"]]
-    there &= (np.abs(of_earth[:, :2]) <= (180, 90)).all(axis=1)
-    if not there.any():
-        return table
-    longitude, latitude = of_earth[there][0, :2]
-    crs = crs or f"EPSG:{326 if latitude >= 0 else 327}{int(longitude + 180) // 6 % 60 + 1:02d}"
-    places = np.where(there[:, None], of_earth, np.nan)
-    try:
-        places[there, :2] = np.transpose(transform("OGC:CRS84", crs, *of_earth[there, :2].T))
-    except Exception as error:  # GDAL's have no public class
-        raise InputError("RIL-776", f"{table.name} has places beyond {crs}", remedy="correct or remove them") from error
-    cells = (dict(zip(at, map(str, place), strict=True)) for place in places.tolist())
-    rows = tuple(tuple((dict(enumerate(row)) | of).values()) for row, of in zip(table.rows, cells, strict=True))
-    header = tuple(unitless(name) if k in at else name for k, name in enumerate(table.header))
-    return replace(table, rows=rows, header=header, crs=crs)
-
-
-def _from_centre(table: TextTable, meant: Mapping[str, int]) -> list[int]:
-    """Columns x, y and z of positions from the Earth's centre, by their names, or their distance alone; empty: none."""
-    named = _geocentric(table)
-    columns = named if named.keys() >= set(POSITION) else meant
-    if "lat" in meant or not columns.keys() >= set(POSITION) or _whole(meant):
-        return []
-    at = [columns[axis] for axis in POSITION]
-    places = table.values(at)
-    places = places[np.isfinite(places).all(axis=1) & places.any(axis=1)]
-    radius = np.linalg.norm(places, axis=1)
-    # A northing may be as large, but no height is 100 km.
-    geocentric = (radius > EARTH[0]) & (radius < EARTH[1]) & (bool(named) | (np.abs(places[:, 2]) > 1e5))
-    return at if len(places) and geocentric.all() else []
-
-
 def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) -> TimedPoses:
     """Poses of a table (forms: see module).
 
@@ -229,9 +130,9 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
         images = tuple(table.text(len(IMAGES) - 1))
         return TimedPoses(None, tuple(pose.inverse() for pose in poses), table.name, images=images)
     meant = meanings(table)
-    first = matrix_at(table)
+    first = by_name.matrix_at(table)
     shaped = first is not None or table.columns in (12, 16)
-    if format == "kitti" or (format == "auto" and shaped and not _whole(meant)):
+    if format == "kitti" or (format == "auto" and shaped and not by_name.have_rotation(meant)):
         return _of_matrices(table, 1.0 if unit is None else unit, timed=first == 1)
     columns = _columns(table, format, meant)
     warnings, quaternion = _of_degrees(table), columns.keys() >= set(QUATERNION)
@@ -320,14 +221,14 @@ def positions_of(
     """
     if format not in ("auto", "csv") or table.header == IMAGES:
         return None
-    stated = {meaning: _column(table, column) for meaning, column in columns.items()}
+    stated = {meaning: stated_column(table, column) for meaning, column in columns.items()}
     # A column that the user assigns to one axis is not another axis by its name: { x = "x", y = "z" } leaves no height.
     meant = {meaning: k for meaning, k in meanings(table).items() if k not in stated.values()} | stated
     known = {"x", "y"} & set(meant)
     many = len(known) < 2 and table.columns >= len(ORDERED["tum"])
-    posed = _whole(meant) or many or matrix_at(table) is not None or untimed(table)
+    posed = by_name.have_rotation(meant) or many or by_name.matrix_at(table) is not None or by_name.untimed(table)
     # Beside degrees, and names of images, nothing says in which frame angles are.
-    if not columns and posed and not (table.crs or of_photographs(table)):
+    if not columns and posed and not (table.crs or by_name.of_photographs(table)):
         return None
     degrees = [axis for axis in known if table.header and NOT_IN_PLANE.search(table.header[meant[axis]])]
     if len(known) < 2 or (degrees and not table.crs):
@@ -335,10 +236,8 @@ def positions_of(
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
         if any(map(NOT_IN_PLANE.search, table.header)):
-            remedy = (
-                "give decimal degrees (neither minutes nor degrees times 10^7) in columns latitude and longitude, or "
-            )
-            remedy += "metres in a plane, as UTM has them (easting, northing), in columns x and y"
+            remedy = "give decimal degrees (neither minutes nor degrees times 10^7) in columns latitude and longitude"
+            remedy += ", or metres in a plane, as UTM has them (easting, northing), in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     placed = [meant["x"], meant["y"]]
     placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
@@ -351,18 +250,6 @@ def positions_of(
     warnings += _rounded(rows, table.name)
     times, images = times_of(table, *timed) if timed else None, tuple(table.text(0)) if named else ()
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings, images)
-
-
-def unread_rotations(table: TextTable) -> tuple[str, ...]:
-    """Warning about columns beside those of positions that seem to hold rotations."""
-    meant = meanings(table)
-    taken = {meant.get(name) for name in ("time", *POSITION)}
-    named = [name for k, name in enumerate(table.header) if k not in taken and ROTATION.fullmatch(unitless(name))]
-    if not named:
-        return ()
-    columns = f"its columns {', '.join(named)} are no rotations about known axes"
-    write = "for poses write places in metres, and qw, qx, qy, qz or roll, pitch, yaw, or rows of 3 x 4 numbers"
-    return (warning("RIL-749", f"{table.name}: its positions alone are read; {columns}: {write}"),)
 
 
 def _rounded(places: Floats, name: str) -> tuple[str, ...]:
@@ -403,73 +290,10 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
 
 
-def _column(table: TextTable, stated: str | int) -> int:
-    """Index of a column that the manifest names or numbers."""
-    for names in (table.header, list(map(unitless, table.header))):
-        if isinstance(stated, str) and stated.strip().lower() in names:
-            return names.index(stated.strip().lower())
-    if isinstance(stated, int) and 1 <= stated <= table.columns:
-        return stated - 1
-    text = f"{table.name}: columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
-    raise InputError("RIL-806", text, remedy="give a name of its first line, or a number from 1")
-
-
-def meanings(table: TextTable) -> dict[str, int]:
-    """Columns by the meaning of their names; no column whose name stands twice, as x of a place and of a quaternion."""
-    columns: dict[str, int] = {}
-    for k, name in enumerate(table.header):
-        if table.header.count(name) > 1:
-            continue
-        word = unitless(name).rpartition("(")[2].strip(" )")  # of a list in brackets whose commas part it
-        matches = ((pattern.fullmatch(word), meaning) for pattern, meaning in WORDS)
-        meant = next((meaning(match) for match, meaning in matches if match), None)
-        if meant is not None:
-            columns.setdefault({"lat": "y", "lon": "x"}.get(meant, meant) if table.crs else meant, k)
-    bare = [unitless(name) for name in table.header]
-    heights = [k for k, name in enumerate(bare) if name in ("u", "d")]
-    if {"e", "n"} <= set(bare) and heights:  # beside others they may mean anything
-        columns.setdefault("z", heights[0])
-    if table.crs and "x" not in columns:
-        columns |= _geocentric(table)
-    return columns
-
-
-def of_photographs(table: TextTable) -> bool:
-    """Whether rows are places of images by name, with angles, as Metashape and Pix4D write them."""
-    meant = meanings(table)
-    by_name = {"x", "y", *ANGLES} <= meant.keys() and not {"time", *QUATERNION} & meant.keys()
-    return by_name and bool(np.isinf(table.values([0])).all())
-
-
-def columns_of_places(table: TextTable) -> dict[Any, str | int]:
-    """Numbers (from 1) of the columns that their names make those of positions, of poses too; none without x and y."""
-    meant = meanings(table)
-    named = {name: k + 1 for name, k in meant.items() if name in ("time", *POSITION)}
-    return dict(named) if {"x", "y"} <= meant.keys() else {}
-
-
-def _geocentric(table: TextTable) -> dict[str, int]:
-    """Columns that are named as coordinates from the Earth's centre, by axis."""
-    found = ((ECEF.fullmatch(unitless(name)), k) for k, name in enumerate(table.header))
-    return {match[1] or match[2]: k for match, k in found if match}
-
-
-def _whole(columns: Mapping[str, int]) -> bool:
-    """Whether there is a rotation among the columns."""
-    return set(QUATERNION) <= set(columns) or set(ANGLES) <= set(columns)
-
-
-def untimed(table: TextTable) -> bool:
-    """Whether rows are x y z and a quaternion of length 1, one a frame."""
-    if table.header or table.columns != len(ORDERED["tum"]) - 1:
-        return False
-    return bool(np.allclose(np.linalg.norm(table.values(range(3, 7)), axis=1), 1.0, atol=1e-3))
-
-
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
     """Columns of poses, by their names or in the order of the format."""
     if format in ("auto", "csv"):
-        if _whole(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
+        if by_name.have_rotation(meant) or {"x", "y", "yaw"} <= set(meant):  # of a robot on a plane
             return meant
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
@@ -477,7 +301,7 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
-    frames = untimed(table)
+    frames = by_name.untimed(table)
     bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])
     if format == "auto" and bare:
         text = f"{table.name}: nothing says whether its quaternions are x, y, z, w or w, x, y, z"
@@ -530,16 +354,6 @@ def _quaternions(table: TextTable, columns: Mapping[str, int]) -> Floats:
         remedy = "give unit quaternions, and the format whose order of columns the file has"
         raise InputError("RIL-266", text, remedy=remedy)
     return np.asarray(Rotation.from_quat(q).as_matrix(), dtype=np.float64)
-
-
-def matrix_at(table: TextTable) -> int | None:
-    """First column of [R | t]: 0, or 1 after a time; None if the first whole row holds no rotation."""
-    first = int(table.columns in (13, 17))
-    if table.columns - first not in (12, 16):
-        return None
-    values = table.values(range(first, table.columns))
-    whole = values[np.isfinite(values).all(1) & values.any(1)][:1].reshape(-1, 4)[:3, :3]
-    return first if len(whole) and np.allclose(whole @ whole.T, np.eye(3), atol=0.05) else None
 
 
 def _of_matrices(table: TextTable, unit: float, timed: bool) -> TimedPoses:

@@ -110,6 +110,13 @@ class Fields:
             raise self.error("RIL-114", key, f"is {_shown(value)}, it should hold entries of its own")
         return Fields(value, self.file, f"{self.at}{key}.", self.used)
 
+    def with_parts(self, prefixes: Mapping[str, str]) -> Fields:
+        """Entries with those of some nested parts among them, each behind the part's prefix."""
+        parts = {key: part for key in prefixes if isinstance(part := self.values.get(key), Mapping)}
+        flat = {f"{prefixes[key]}{name}": value for key, part in parts.items() for name, value in part.items()}
+        whole = {key: value for key, value in self.values.items() if key not in parts}
+        return Fields(whole | flat, self.file, self.at, self.used)
+
     def text(self, key: str, default: str | None = None) -> str:
         """A word; ``default`` if the key is missing."""
         if key not in self and default is not None:
@@ -135,18 +142,15 @@ class Fields:
         """A matrix of finite numbers."""
         return np.array(self.numbers(key, rows * columns)).reshape(rows, columns)
 
-    def size(self, width: str, height: str) -> tuple[int, int]:
-        """Image size from two keys, pixels; ``UNKNOWN_SIZE`` if both are missing."""
-        if width not in self and height not in self:
+    def size(self, *keys: str) -> tuple[int, int]:
+        """Image size, pixels, from keys of width and height, or from one of both; ``UNKNOWN_SIZE`` if none is there."""
+        if not self.has(*keys):
             return UNKNOWN_SIZE
-        return self._pixels(width, self.number(width)), self._pixels(height, self.number(height))
-
-    def pair_of_pixels(self, key: str) -> tuple[int, int]:
-        """Image size from one key with width and height; ``UNKNOWN_SIZE`` if it is missing."""
-        if key not in self:
-            return UNKNOWN_SIZE
-        width, height = self.numbers(key, 2)
-        return self._pixels(key, width), self._pixels(key, height)
+        width, height = map(self.number, keys) if keys[1:] else self.numbers(keys[0], 2)
+        for key, value in (keys[0], width), (keys[-1], height):
+            if value < 2 or value != int(value):
+                raise self.error("RIL-122", key, f"= {value:g} is no image size in pixels")
+        return int(width), int(height)
 
     def transform(self, rotation: str, translation: str) -> RigidTransform:
         """Rigid transform from a 3 x 3 matrix and three numbers."""
@@ -273,11 +277,6 @@ class Fields:
         if not abs(number) < GREATEST:
             raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number below {GREATEST:g}")
         return number
-
-    def _pixels(self, key: str, value: float) -> int:
-        if value < 2 or value != int(value):
-            raise self.error("RIL-122", key, f"= {value:g} is no image size in pixels")
-        return int(value)
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
         """Rigid transform of the numbers at ``key``."""

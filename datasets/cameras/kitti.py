@@ -67,7 +67,7 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     with within(fields.file):
         k, T_camera_reference = decompose(projection, label)
     number = label.rpartition("_")[2] if label.startswith("P_rect") else ""
-    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.pair_of_pixels(f"S_rect_{number}"))
+    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.size(f"S_rect_{number}"))
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)
 
 

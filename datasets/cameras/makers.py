@@ -138,9 +138,8 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
         f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
         camera = f.optics("fx fy ppx ppy", f.size("width", "height"), "none").camera
         pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
-        cameras[number, camera.width, camera.height] = CalibratedCamera(
-            f"Infrared {number}", f.distorted("coeffs", camera), pose
-        )
+        name, lens = f"Infrared {number}", f.distorted("coeffs", camera)
+        cameras[number, camera.width, camera.height] = CalibratedCamera(name, lens, pose)
     return list(cameras.values())
 
 
@@ -168,9 +167,7 @@ GROUP = re.compile(r"(in|ex)trinsics?|camera|stereo|rig|calibration")
 
 def _flat(f: Fields) -> Fields:
     """Entries with those of the parts ``intrinsic``, ``extrinsic``, ``camera`` and the like among them."""
-    parts = {key: value for key, value in f.values.items() if GROUP.fullmatch(key) and isinstance(value, Mapping)}
-    flat = {key: value for part in parts.values() for key, value in part.items()}
-    return Fields({**{k: v for k, v in f.values.items() if k not in parts}, **flat}, f.file, f.at, f.used)
+    return f.with_parts({key: "" for key in f.values if GROUP.fullmatch(key)})
 
 
 def _parts(f: Fields) -> list[Fields]:

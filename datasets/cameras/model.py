@@ -55,6 +55,12 @@ def of_size(cameras: list[CalibratedCamera], sizes: Sizes | None) -> list[Calibr
     return fit if len(fit) == 2 else cameras
 
 
+def relative_pose(left: CalibratedCamera, right: CalibratedCamera) -> RigidTransform | None:
+    """T_right_left of two cameras of one calibration; None if it does not state both poses."""
+    T_left, T_right = left.T_camera_reference, right.T_camera_reference
+    return None if T_left is None or T_right is None else T_right @ T_left.inverse()
+
+
 def parallel(baseline: float) -> RigidTransform:
     """T_right_left of parallel cameras, the right one ``baseline`` along the left one's x axis."""
     return RigidTransform(np.eye(3), np.array([-baseline, 0.0, 0.0]))

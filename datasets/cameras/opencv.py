@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,11 +87,7 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def by_side(f: Fields) -> Fields:
     """Entries with those of ``left`` and ``right`` among them: ``left_K`` for K of ``left``."""
-    parts = {side: f.values.get(side) for side in CAMERAS}
-    flat = {
-        f"{side}_{key}": value for side, of in parts.items() if isinstance(of, Mapping) for key, value in of.items()
-    }
-    return Fields({**{key: value for key, value in f.values.items() if key not in parts}, **flat}, f.file, f.at, f.used)
+    return f.with_parts({side: f"{side}_" for side in CAMERAS})
 
 
 def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -179,7 +174,7 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
     """Width and height; ``side``: 1 left, 2 right; ``rille calibrate`` writes both sizes if they differ."""
     for key in (f"image_size{side}", "image_size", "imageSize", "resolution"):
         if key in f:
-            return f.pair_of_pixels(key)
+            return f.size(key)
     return f.size(f.spelt(WIDTHS), f.spelt(HEIGHTS))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.cameras.model import CalibratedCamera, relative_pose
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Camera, Rig, Sizes
 from rille.stages.geometry.lens import Lens
@@ -55,12 +55,12 @@ def rig_of(
     if sizes is not None:
         _check_scale((left, right), sizes)
     lenses = {"left": _sized(left, of_left), "right": _sized(right, of_right)}
-    if left.T_camera_reference is None or right.T_camera_reference is None:
+    T_right_left = relative_pose(left, right)
+    if T_right_left is None:
         lacking = left if left.T_camera_reference is None else right
         text = f"cameras {left.name} and {right.name} have no relative pose: the calibration does not say where"
         remedy = "give the baseline in metres, or a stereo calibration"
         raise InputError("RIL-128", f"{text} {lacking.name} stands", remedy=remedy)
-    T_right_left = right.T_camera_reference @ left.T_camera_reference.inverse()
     rig = Rig(lenses["left"].ideal_camera(), lenses["right"].ideal_camera(), T_right_left)
     # 1e-6: below, in any usual unit of length, both cameras stand in one place.
     if rig.baseline < 1e-6:

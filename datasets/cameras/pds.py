@@ -102,7 +102,7 @@ def _pinhole(f: Fields) -> tuple[Camera, Floats, float]:
     skew, fy = float(v @ x), float(v @ y)
     if fy < 0:
         raise f.error("RIL-953", "MODEL_COMPONENT_4", "mirrors the image", "give a model without mirroring")
-    return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), f.pair_of_pixels("Dimensions")), np.array([x, y, a]), skew
+    return f.camera("MODEL_COMPONENT_3", (fx, fy, cx, cy), f.size("Dimensions")), np.array([x, y, a]), skew
 
 
 def _model(text: str) -> str:

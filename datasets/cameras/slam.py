@@ -103,7 +103,7 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
             raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
         if abs(np.linalg.norm(q) - 1) > 0.01:
             raise pose.error("RIL-767", "qx, qy, qz, qw", f"have length {np.linalg.norm(q):.4g}, it should be 1")
-        lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.pair_of_pixels(k), BASALT[kind])
+        lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.size(k), BASALT[kind])
         T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
         found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
     return found
@@ -116,7 +116,7 @@ def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
     if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV\d+)", kind):
         raise f.error("RIL-769", "lensmodel", f"= {kind} is not read", "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE")
     fx, fy, cx, cy, *coefficients = f.numbers("intrinsics")
-    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("imagersize"))
+    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.size("imagersize"))
     rt = np.array(f.numbers("extrinsics", 6))
     lens = f.lens("intrinsics", camera, *by_count(tuple(coefficients)))
     return [CalibratedCamera(path.stem, lens, f.rigid("extrinsics", rotation_exp(rt[:3]), rt[3:]))]
@@ -135,7 +135,7 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
         remedy = "calibrate as pinhole with radtan or equidistant"
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
     fx, fy, cx, cy = f.numbers("intrinsics", 4)
-    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.pair_of_pixels("resolution")))
+    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.size("resolution")))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

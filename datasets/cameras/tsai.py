@@ -40,7 +40,7 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
     if np.linalg.det(axes) < 0:
         mirrored = "and the other two directions mirror the image"
         raise f.error("RIL-147", "u_direction", mirrored, "give a model without mirroring")
-    T_world_body = f.rigid("R", f.matrix("R", 3, 3), np.array(f.numbers("C", 3)))
+    T_world_body = f.transform("R", "C")
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
     found = CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())
     f.check_lens()

@@ -424,12 +424,10 @@ def _two_clocks(
     offset = float(np.median(apart)) if len(join(left, right).places) < 2 else 0.0
     k = int(np.argmax(np.abs(apart - offset)))
     if abs(apart[k] - offset) > most:
-        raise InputError(
-            "RIL-823",
-            f"by order {pairs[k].left.name} is paired with {pairs[k].right.name}, {apart[k]:+.4g} s off by their time "
-            f"stamps ({most:.3g} s are allowed): was an image lost?",
-            remedy='images.pair = "nearest" pairs by time stamp; or state images.tolerance (s)',
-        )
+        off = f"{apart[k]:+.4g} s off by their time stamps ({most:.3g} s are allowed): was an image lost?"
+        text = f"by order {pairs[k].left.name} is paired with {pairs[k].right.name}, {off}"
+        remedy = 'images.pair = "nearest" pairs by time stamp; or state images.tolerance (s)'
+        raise InputError("RIL-823", text, remedy=remedy)
     text = f"time stamps are of two clocks, or not of one time: in all pairs the right one is {offset:.6g} s later"
     return [warning("RIL-824", text)] if abs(offset) > MOST_APART else []
 

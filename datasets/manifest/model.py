@@ -415,9 +415,8 @@ class World(Table):
         if scale is not None and not 0.9 < scale < 1.1:
             where = f"is {scale:.2g} m long" if scale else "does not exist"
             text = f"a metre of {self.crs} {where} at origin = {list(self.origin or ())}"
-            raise ValueError(
-                f"{text}: are easting and northing exchanged? else give them in a CRS of the place, as UTM"
-            )
+            doubt = "are easting and northing exchanged? else give them in a CRS of the place, as UTM"
+            raise ValueError(f"{text}: {doubt}")
         return self
 
     @property

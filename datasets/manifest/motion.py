@@ -16,32 +16,20 @@ from rille.datasets import protocol
 from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.pairing import ImagePair, ends, stamps_of
-from rille.datasets.imu import at_frames, read_imu
-from rille.datasets.manifest.model import (
-    Attitude,
-    Imu,
-    Manifest,
-    Odometry,
-    PoseFile,
-    PositionFile,
-    Recorded,
-    Times,
-    Truth,
-)
+from rille.datasets.imu import at_frames, read_imu, sensed
+from rille.datasets.manifest import model
 from rille.datasets.manifest.rig import direction
 from rille.datasets.poses import (
     TimedPoses,
     TimedPositions,
-    columns_of_places,
     coverage,
     interpolate,
-    meanings,
     poses_of,
     positions_of,
     read_motion,
     refuse_apart,
-    unread_rotations,
 )
+from rille.datasets.text.columns import columns_of_places, meanings, unread_rotations
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated
@@ -86,7 +74,7 @@ class MotionReader:
     growing: bool = False
     crs: str = ""
 
-    def read(self, manifest: Manifest) -> protocol.Sequence:
+    def read(self, manifest: model.Manifest) -> protocol.Sequence:
         """The sequence with what the tables ``times``, ``truth``, ``odometry``, ``positions``, ``attitude``, ``imu``
         state.
 
@@ -121,7 +109,7 @@ class MotionReader:
         """Add warnings to the sequence."""
         self.state(warnings=(*self.sequence.warnings, *lines))
 
-    def times(self, section: Times) -> tuple[float, ...]:
+    def times(self, section: model.Times) -> tuple[float, ...]:
         """Time of each pair, s; for one without a row interpolated between its neighbours.
 
         Raises
@@ -208,11 +196,11 @@ class MotionReader:
         remaining, whole = iter(rows), sum(not pair.absent for pair in self.pairs)
         return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
-    def poses(self, section: PoseFile | Attitude, table: str, read: TextTable | None = None) -> Poses:
+    def poses(self, section: model.PoseFile | model.Attitude, table: str, read: TextTable | None = None) -> Poses:
         """T_reference_left of each pair from a file of a body's poses, which may have been ``read`` before."""
         path = self.root / section.file
         rows = read or read_motion(path, section.format, self.crs)
-        timed = poses_of(rows, section.format, section.unit if isinstance(section, PoseFile) else 1.0)
+        timed = poses_of(rows, section.format, section.unit if isinstance(section, model.PoseFile) else 1.0)
         self.warn(timed.warnings)
         poses: Poses = timed.poses
         if timed.times is not None:
@@ -228,7 +216,7 @@ class MotionReader:
         mount = section.T_body_left
         return poses if mount is None else tuple(pose and pose @ mount for pose in poses)
 
-    def of_times(self, timed: TimedPoses, section: PoseFile | Attitude, table: str) -> Poses:
+    def of_times(self, timed: TimedPoses, section: model.PoseFile | model.Attitude, table: str) -> Poses:
         """The pose at the time of each pair; None where the file has none about that time."""
         path, at = self.root / section.file, self.sequence.times
         if at is None:
@@ -244,7 +232,7 @@ class MotionReader:
             self.state(truth_record=protocol.Positions(track, moved.times, section.max_gap))
         return poses
 
-    def of_numbers(self, timed: TimedPoses, section: PoseFile | Attitude) -> Poses | None:
+    def of_numbers(self, timed: TimedPoses, section: model.PoseFile | model.Attitude) -> Poses | None:
         """The pose of each pair whose number, in the name of its left image, stands in place of a time in the file.
 
         None: what stands there are times, or numbers of other images.
@@ -278,7 +266,7 @@ class MotionReader:
             raise InputError("RIL-975", f"{text} ({left})", remedy="give the model of these images")
         return poses
 
-    def truth(self, section: Truth) -> None:
+    def truth(self, section: model.Truth) -> None:
         """Read true poses of each pair, or true positions with their own times."""
         rows = read_motion(self.root / section.file, section.format, self.crs)
         alone = positions_of(rows, section.format, section.columns, section.unit)
@@ -295,14 +283,14 @@ class MotionReader:
         self.state(truth=self.poses(section, "truth", rows), truth_mount=section.T_body_left)
         self.state(truth_sigma_m=section.sigma_m or 0.0, truth_sigma_rad=math.radians(section.sigma_deg or 0.0))
 
-    def odometry(self, section: Odometry) -> None:
+    def odometry(self, section: model.Odometry) -> None:
         """Read dead reckoning, which is a measurement if its accuracy is stated."""
         self.state(odometry=self.poses(section, "odometry"))
         if section.drift is not None and section.turn_deg is not None:
             sigmas = {"drift": section.drift, "turn": math.radians(section.turn_deg)}
             self.state(priors={**self.sequence.priors, "odometry": sigmas})
 
-    def true_positions(self, section: Truth, found: TimedPositions) -> protocol.Positions:
+    def true_positions(self, section: model.Truth, found: TimedPositions) -> protocol.Positions:
         """True positions, without rotations."""
         if (section.sigma_m or section.sigma_deg) is not None:
             text = f"truth.sigma_m, sigma_deg: {section.file} holds positions, to which no covariance is held"
@@ -314,7 +302,7 @@ class MotionReader:
             lever = protocol.vector_of(section.T_body_left.inverse().translation)
         return protocol.Positions(rows, times, section.max_gap, lever)
 
-    def refuse_sparse(self, section: PoseFile | Attitude, times: Sequence[float], table: str) -> None:
+    def refuse_sparse(self, section: model.PoseFile | model.Attitude, times: Sequence[float], table: str) -> None:
         """Refuse rows that mostly are more than ``max_gap``, s, apart, so that nothing can be interpolated."""
         spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         if spacing > section.max_gap:
@@ -324,7 +312,7 @@ class MotionReader:
             raise InputError("RIL-804", text, remedy=remedy)
 
     def positions(
-        self, section: Truth | PositionFile, found: TimedPositions, table: str
+        self, section: model.Truth | model.PositionFile, found: TimedPositions, table: str
     ) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...] | None]:
         """Positions in metres, and their times (s) by the images' clock, or numbers of pairs; None: one for each pair.
 
@@ -336,28 +324,29 @@ class MotionReader:
             Both have times, but none in common; or not both have, and there is not one position for each pair.
         """
         self.warn(found.warnings)
-        if found.times is not None and self.sequence.times is not None:
+        clock, pairs = self.sequence.times, len(self.pairs)
+        if found.times is not None and clock is not None:
             times = tuple(t + section.time_offset for t in found.times)
-            refuse_apart(times, self.sequence.times, found.name)
+            refuse_apart(times, clock, found.name)
             return found.positions, times
-        rows = found.positions[: len(self.pairs)] if self.growing else found.positions
         at = {k: row for k, row in enumerate(_rows_of_images(found.images, self.pairs)) if row is not None}
+        named = tuple(found.positions[row] for row in at.values())
+        if len(named) == pairs:
+            return named, None
         # Measurements may be of numbers of pairs.
-        numbers = tuple(map(float, range(len(self.pairs)))) if table == "positions" else None
-        clock = None if len(at) == len(self.pairs) else self.sequence.times or numbers
-        if at and (clock or len(at) == len(self.pairs)):
-            return tuple(found.positions[row] for row in at.values()), clock and tuple(clock[k] for k in at)
-        of_images = bool(at) or any(name.lower().endswith(SUFFIXES) for name in found.images)
-        if of_images or len(rows) != len(self.pairs):
-            there = f"{len(at)} positions by names of left images" if of_images else f"{len(rows)} positions"
-            text = f"{table}.file: {section.file} has {there} for {len(self.pairs)} pairs"
-            remedy = (
-                "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
-            )
-            raise IncompleteError("RIL-803", f"{text}, and not both have times", remedy=remedy)
-        return rows, None
+        clock = clock or (tuple(map(float, range(pairs))) if table == "positions" else None)
+        if named and clock:
+            return named, tuple(clock[k] for k in at)
+        rows = found.positions[:pairs] if self.growing else found.positions
+        of_images = bool(named) or any(name.lower().endswith(SUFFIXES) for name in found.images)
+        if len(rows) == pairs and not of_images:
+            return rows, None
+        there = f"{len(named)} positions by names of left images" if of_images else f"{len(rows)} positions"
+        text = f"{table}.file: {section.file} has {there} for {pairs} pairs, and not both have times"
+        remedy = "give one a pair, times of both ([times] of the pairs), or names of left images in the first column"
+        raise IncompleteError("RIL-803", text, remedy=remedy)
 
-    def doubt_clock(self, section: Recorded, table: TextTable) -> None:
+    def doubt_clock(self, section: model.Recorded, table: TextTable) -> None:
         """Warn of times since 1970 that are called GPS time, unless an offset is stated."""
         column = meanings(table).get("time", -1)
         named = column >= 0 and table.header and GPS_TIME.fullmatch(unitless(table.header[column]))
@@ -365,7 +354,7 @@ class MotionReader:
             text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
             self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
 
-    def measured(self, section: PositionFile) -> None:
+    def measured(self, section: model.PositionFile) -> None:
         """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.
 
         Raises
@@ -395,29 +384,22 @@ class MotionReader:
         }
         self.state(priors={**self.sequence.priors, "positions": measured})
 
-    def attitude(self, section: Attitude) -> None:
+    def attitude(self, section: model.Attitude) -> None:
         """Read rotations of a sensor, and the vertical if that is known in the file's reference frame."""
         poses = self.poses(section, "attitude")
         self.state(attitude=tuple(None if pose is None else protocol.rows_of(pose.rotation) for pose in poses))
         if section.up is not None:
             self.state(up=tuple(None if p is None else direction(section.up, p.inverse()) for p in poses))
 
-    def imu(self, section: Imu) -> None:
+    def imu(self, section: model.Imu) -> None:
         """Read rotations and vertical by an IMU."""
-        sequence = self.sequence
-        if sequence.times is None:
+        at = self.sequence.times
+        if at is None:
             text = "[imu] needs times, but the pairs have none"
             raise InputError("RIL-232", text, remedy=NEEDS_TIMES)
         imu = read_imu(self.root / section.file)
         shifted = replace(imu, times=imu.times + section.time_offset)
-        inertial = at_frames(shifted, sequence.times, section.T_imu_left)
-        self.state(
-            attitude=inertial.attitude if any(inertial.attitude) else sequence.attitude,
-            up=inertial.up if any(inertial.up) else sequence.up,
-            imu_axes=inertial.axes,
-            notes=(*sequence.notes, *inertial.notes),
-            warnings=(*sequence.warnings, *inertial.warnings),
-        )
+        self.sequence = sensed(self.sequence, at_frames(shifted, at, section.T_imu_left))
 
 
 def _rows_of_images(names: Sequence[str], pairs: Sequence[ImagePair]) -> list[int | None]:

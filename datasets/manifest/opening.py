@@ -201,7 +201,7 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
     InputError
         A pattern matches no file, both match the same files, or images have no partners.
     """
-    found, search = {}, Search()
+    found, search = list[list[Path]](), Search()
     for side, stated in (("left", images.left), ("right", images.right)):
         # A folder stands for its files.
         pattern = f"{stated.rstrip('/')}/*" if stated and os.path.isdir(root / stated) else stated
@@ -216,19 +216,12 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
             within_root = "" if pattern.startswith("/") else f" in {root}"
             text = "; ".join([f"images.{side} = {pattern!r} finds no file{within_root}", *search.closed[:1]])
             raise IncompleteError("RIL-217", text, remedy="correct the pattern, root or rights")
-        found[side] = paths
-    both = sorted(set(found["left"]) & set(found["right"]))
-    if both:
+        found.append(paths)
+    left, right = found
+    if both := sorted(set(left) & set(right)):
         text = f"images.left and images.right both find {both[0]}"
         raise InputError("RIL-218", text, remedy="narrow the patterns")
-    return pair_up(
-        found["left"],
-        found["right"],
-        images.pair,
-        growing=digests.growing,
-        tolerance=images.tolerance,
-        warnings=lines,
-    )
+    return pair_up(left, right, images.pair, growing=digests.growing, tolerance=images.tolerance, warnings=lines)
 
 
 def dotted(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

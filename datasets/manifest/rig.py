@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.cameras import CalibratedCamera, read_cameras, rig_of
-from rille.datasets.cameras.model import UNKNOWN_SIZE, of_size, parallel
+from rille.datasets.cameras.model import UNKNOWN_SIZE, of_size, parallel, relative_pose
 from rille.datasets.cameras.pair import MAX_OFF_CENTRE
 from rille.datasets.manifest.model import Cameras, Manifest, PinholeLens, RigSection
 from rille.datasets.protocol import Vector, vector_of
@@ -165,9 +165,7 @@ def _placed(
     left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame, by the manifest, else by the files; and warnings."""
-    of_files = None
-    if left.T_camera_reference is not None and right.T_camera_reference is not None:
-        of_files = right.T_camera_reference @ left.T_camera_reference.inverse()
+    of_files = relative_pose(left, right)
     stated = _stated(section, of_files) if pinned is None else pinned.T_right_left
     if stated is None and of_files is None:
         text = "the rig is not known: nothing says where the right camera stands"

@@ -14,17 +14,15 @@ class SceneFacts(Facts):
 
 
 class DrivenFacts(Facts):
-    """True motion along one ``leg``: number of ``frames``, and the left camera's ``poses``, 3 x 4 numbers each, m."""
+    """True motion along a leg: number of ``frames``, and the left camera's ``poses``, 3 x 4 numbers each, m."""
 
-    leg: int
     frames: int
     poses: list[list[float]]
 
 
 class SensedFacts(Facts):
-    """Sensors' reports of one ``leg``, of each frame: ``up`` in the left camera, ``odometry`` x, y, m, heading, rad."""
+    """Sensors' reports of a leg, of each frame: ``up`` in the left camera, ``odometry`` x, y, m, heading, rad."""
 
-    leg: int
     up: list[list[float]]
     odometry: list[list[float]]
 

@@ -149,16 +149,10 @@ def radiance(
     albedo = tuple(np.array(scene[f"albedo_{k}"][:], order="C") for k in range(ALBEDO_LEVELS))
     light = scene.meta["scene"]
     e, a = math.radians(light["sun_elevation_deg"]), math.radians(light["sun_azimuth_deg"])
-    bed = _Bed(
-        field.height,
-        np.ascontiguousarray(scene["sunlit"][:]),
-        np.ascontiguousarray(scene["tint"][:]),
-        field.x0,
-        field.y0,
-        field.cell,
-        math.tan(math.radians(light["slope_deg"])),
-        np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)]),
-    )
+    sun = np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)])
+    rise = math.tan(math.radians(light["slope_deg"]))
+    sunlit, tint = (np.ascontiguousarray(scene[name][:]) for name in ("sunlit", "tint"))
+    bed = _Bed(field.height, sunlit, tint, field.x0, field.y0, field.cell, rise, sun)
     values = _shade(bed, albedo, np.ascontiguousarray(origin), rays, distance, 1.0 / (sampling * camera.fx))
     blocks = values.reshape(camera.height, sampling, camera.width, sampling)
     hit = np.isfinite(blocks).all(axis=(1, 3))

@@ -255,4 +255,4 @@ def drive_stage(
         "wheels": wheels,
     }
     arrays |= {name: np.array([getattr(s, name) for s in trail]) for name in ("tilt", "clearance", "step")}
-    return Bundle(arrays, {"leg": leg, "frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})
+    return Bundle(arrays, {"frames": len(frames), "poses": [m.reshape(-1).tolist() for m in lefts]})

@@ -51,4 +51,4 @@ def sense_stage(params: RoverParams, drive: Bundle[DrivenFacts], *, leg: int) ->
     # 0.05 m/s2: of the accelerometer.
     noise = 0.05 * rng.standard_normal(len(at))
     arrays = {"odometry": odometry, "up": up, "acceleration": np.abs(np.array(acceleration) + noise)}
-    return Bundle(arrays, {"leg": leg, "up": up.tolist(), "odometry": odometry.tolist()})
+    return Bundle(arrays, {"up": up.tolist(), "odometry": odometry.tolist()})

@@ -84,12 +84,9 @@ def body_poses(p: MockupParams) -> list[RigidTransform]:
     turns = np.deg2rad(p.turn_deg) * np.arange(p.frames)
     # Each step follows the heading half-way: with a constant turn they are chords of a circle.
     ahead = turns - 0.5 * np.deg2rad(p.turn_deg)
-    steps = np.column_stack(
-        [
-            p.sideways * np.cos(ahead) - p.forward * np.sin(ahead),
-            p.sideways * np.sin(ahead) + p.forward * np.cos(ahead),
-        ]
-    )
+    across = p.sideways * np.cos(ahead) - p.forward * np.sin(ahead)
+    along = p.sideways * np.sin(ahead) + p.forward * np.cos(ahead)
+    steps = np.column_stack([across, along])
     steps[0] = 0.0
     offsets = np.cumsum(steps, axis=0)
     # The drive is centred across the bed.

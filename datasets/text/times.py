@@ -101,11 +101,8 @@ def _decimal(value: str | int | float, what: str, line: int) -> Decimal:
         exact = Decimal("nan")
     # Nanoseconds reach the greatest in the year 5138; quotients of smaller ones leave what a Decimal can hold.
     if not exact.is_finite() or exact.copy_abs() > 10**20 or 0 < exact.copy_abs() < Decimal("1e-20"):
-        raise InputError(
-            "RIL-291",
-            f"{what}, line {line}: {value!r} is not a time",
-            remedy="give numbers, or dates with the time of day in one column, as 2026-05-31 12:00:00",
-        )
+        remedy = "give numbers, or dates with the time of day in one column, as 2026-05-31 12:00:00"
+        raise InputError("RIL-291", f"{what}, line {line}: {value!r} is not a time", remedy=remedy)
     return exact
 
 

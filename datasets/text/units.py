@@ -32,10 +32,9 @@ SPELT = (
     ("ft", "feet|foot"),
     ("in", "inch(es)?"),
     ("yd", "yards?"),
-    *(
-        (symbol, f"{spelt}s(ec(ond)?s?)?")
-        for symbol, spelt in (("ms", "m(illi)?"), ("us", "(u|micro)"), ("ns", "n(ano)?"))
-    ),
+    ("ms", "m(illi)?s(ec(ond)?s?)?"),
+    ("us", "(u|micro)s(ec(ond)?s?)?"),
+    ("ns", "n(ano)?s(ec(ond)?s?)?"),
     ("s", "sec(ond)?s?"),
 )
 """Symbols of units, and their other spellings."""

@@ -66,9 +66,8 @@ def write_path(path: Path, planned: Bundle, place: Georeference | None = None) -
         crs = _enter_crs(package, place)
         _add_layer(package, "path", LINE_Z, crs, [(vertices if len(vertices) > 1 else None, facts)])
         if len(vertices):
-            _add_layer(
-                package, "ends", POINT_Z, crs, [(vertices[0], {"name": "start"}), (vertices[-1], {"name": "target"})]
-            )
+            ends = [(vertices[0], {"name": "start"}), (vertices[-1], {"name": "target"})]
+            _add_layer(package, "ends", POINT_Z, crs, ends)
         package.commit()
         content = bytearray(package.serialize())
     # Version of the SQLite library that wrote the file: zero, so that equal paths make equal files.

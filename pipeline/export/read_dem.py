@@ -121,9 +121,8 @@ def _without_marks(dem: DemFile) -> DemFile:
     inner = scipy.ndimage.binary_erosion(marked, np.ones((3, 3)), border_value=1)
     # No ground rises by 300 cells, or by 1500 m, within one cell.
     steep = gap > 300.0 * cell and several and apart
-    text = (
-        f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, the others are {low:.6g} to {high:.6g} m: taken as {{}}"
-    )
+    others = f"the others are {low:.6g} to {high:.6g} m"
+    text = f"{dem.name}: {mark:.9g} in {marked.sum()} cells {{}}, {others}: taken as {{}}"
     if not (steep or (gap > 1500.0 and (several or apart)) or (usual and 2 * inner.sum() < marked.sum())):
         doubt = text.format("may be no elevation", "one; if it marks what is unknown, state it in the file, as NODATA")
         return replace(dem, warnings=(*dem.warnings, warning("RIL-726", doubt))) if usual else dem

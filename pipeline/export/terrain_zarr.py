@@ -27,7 +27,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.rasters import plane_tag, tiles_of, whole
 from rille.pipeline.export.view import RunView
-from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME
+from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME, raster_transform
 from rille.stages.core.declare import Array
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.terrain import merge
@@ -80,15 +80,12 @@ def _attributes(spec: Array) -> dict[str, Any]:
 
 
 def _coordinates(lattice: Lattice) -> dict[str, Any]:
-    half = 0.5 * lattice.cell
-    # In GDAL's order, unlike that of affine.
-    corner = lattice.x0 - half, lattice.cell, 0.0, lattice.y0 + half, 0.0, -lattice.cell
     reference = {
         # crs_wkt is CF's name, spatial_ref GDAL's: readers expect either.
         "crs_wkt": ENGINEERING_CRS,
         "spatial_ref": ENGINEERING_CRS,
         "long_name": "Rille world frame (local metres)",
-        "GeoTransform": " ".join(f"{v:.17g}" for v in corner),
+        "GeoTransform": " ".join(f"{v:.17g}" for v in raster_transform(lattice, None).to_gdal()),
     }
     coordinates: dict[str, Any] = {"spatial_ref": ((), np.int32(0), reference)}
     for axis, values, words in (("x", lattice.xs(), "right"), ("y", lattice.ys(), "ahead")):

@@ -164,10 +164,9 @@ def axes(place: Georeference | None) -> str:
     if place is None:
         return "the CRS's x and y are the world frame's; rows fall with y"
     e, n, h = place.origin
-    return (
-        f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z with x, "
-        f"y, z of the frame and a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
-    )
+    formulas = f"easting = {e:.3f} + x cos a + y sin a, northing = {n:.3f} - x sin a + y cos a, height = {h:.3f} + z"
+    angle = f"a = {np.degrees(place.azimuth):.6g} degrees, clockwise from grid north"
+    return f"{formulas} with x, y, z of the frame and {angle}"
 
 
 def write_trajectory_kitti(path: Path, poses: NDArray[np.float64]) -> None:

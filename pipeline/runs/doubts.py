@@ -79,14 +79,10 @@ def _wrong_matches(result: Any, left: NDArray[Any], right: NDArray[Any]) -> Iter
         return
     on_lines, repeated = judged
     if on_lines < doubt.MIN_RIGID_SHARE:
-        text = (
-            f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar "
-            "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
-        )
-        yield warning("RIL-703", text)
+        share = f"only {100 * on_lines:.0f} % of the matches lie within {MAX_LINE_DISTANCE_PX:.0f} px of one epipolar"
+        text = "geometry: wrong matches, things that move, or a lens that distorts: look at them first"
+        yield warning("RIL-703", f"{share} {text}")
     if repeated > doubt.MAX_REPEATED_SHARE:
-        text = (
-            f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line: on a repeating "
-            "pattern they may be off by a period: look at them first"
-        )
-        yield warning("RIL-704", text)
+        share = f"{100 * repeated:.0f} % of the matches look as well elsewhere on their epipolar line"
+        text = "on a repeating pattern they may be off by a period: look at them first"
+        yield warning("RIL-704", f"{share}: {text}")

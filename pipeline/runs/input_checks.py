@@ -395,9 +395,8 @@ def judge_pairs(unlike: Mapping[int, str], tested: int, swapped: int, names: Ser
     """Pairs, of those ``tested``, that do not fit the rig as the others do, some of them ``swapped``; ``unlike``: cause
     by frame."""
     if not unlike:
-        return judge(
-            "sides", f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
-        )
+        text = f"left and right fit each other alike in all of {count(tested, 'pair')} over the sequence"
+        return judge("sides", text)
     first, why = next(iter(unlike.items()))
     figure = "beyond" if 2 * swapped > tested else "unlike"
     text = f"{len(unlike)} of {tested} pairs over the sequence do not fit the rig, first frame {names[first]}: {why}"
@@ -409,10 +408,8 @@ def judge_epipolar(facts: Mapping[str, Any]) -> Finding:
     if "residual_before_px" not in facts:
         return judge("epipolar", str(facts.get("words", "not checked")), {"known": 0})
     before, after, offset = (float(facts[name]) for name in ("residual_before_px", "residual_after_px", "row_offset"))
-    words = (
-        f"off the epipolar lines {offset:+.2f} px, roll {float(facts['roll_deg']):+.3f} degrees, "
-        f"residual {before:.2f} px RMS, adjusted {after:.2f}"
-    )
+    words = f"off the epipolar lines {offset:+.2f} px, roll {float(facts['roll_deg']):+.3f} degrees"
+    words = f"{words}, residual {before:.2f} px RMS, adjusted {after:.2f}"
     turn = float(facts["turn_deg"])
     if abs(turn) > MAX_IMAGE_TURN_DEG:
         words = f"the right image is turned by {abs(turn):.0f} degrees against the left one; {words}"
@@ -453,8 +450,6 @@ def judge_motion(motions: Mapping[tuple[int, int], Mapping[str, Any]], names: Se
     overlap = {k: float(m["overlap"] or 0.0) for k, m in motions.items()}
     length = [float(m["median_length"]) for m in motions.values() if m["median_length"] is not None]
     (a, b), least = min(overlap.items(), key=lambda kv: kv[1])
-    text = (
-        f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} % "
-        f"from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
-    )
+    text = f"successive images overlap by {100 * np.median(list(overlap.values())):.0f} %, least {100 * least:.0f} %"
+    text += f" from frame {names[a]} to {names[b]}{f'; motion {np.median(length):.1f} px' if length else ''}"
     return judge("motion", text, {"overlap": least, **({"largest motion, px": max(length)} if length else {})})

@@ -46,12 +46,10 @@ def reading(*runs: Path) -> Iterator[None]:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError) as error:
         which, what = " or ".join(map(name, runs)), f"{type(error).__name__}: {error}"
-        raise ConfigError(
-            "RIL-980",
-            f"files of run {which} are not as Rille writes them ({what})",
-            remedy="run the same command again, or remove its folder; if it is your own and whole, this is a fault of "
-            "Rille, and --debug shows where",
-        ) from error
+        text = f"files of run {which} are not as Rille writes them ({what})"
+        fault = "if it is your own and whole, this is a fault of Rille, and --debug shows where"
+        remedy = f"run the same command again, or remove its folder; {fault}"
+        raise ConfigError("RIL-980", text, remedy=remedy) from error
 
 
 def find(text: str, runs: Path) -> Path:

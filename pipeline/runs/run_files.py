@@ -141,10 +141,8 @@ def write(folder: Path, view: RunView, made: Made, store: Store) -> dict[str, An
     frames = catalogue.describe([p.name for p in folder.iterdir()], view, vertical)
     write_json(folder / "frames.json", frames)
     (facts,) = _files(made["facts"], store).values()
-    figures = [
-        FIGURE.validate_json(drawn) for o in gallery.OUTPUTS for drawn in _files(made.get(o.name), store).values()
-    ]
-    return write_report(folder, view, json.loads(facts), figures)
+    drawn = (content for o in gallery.OUTPUTS for content in _files(made.get(o.name), store).values())
+    return write_report(folder, view, json.loads(facts), list(map(FIGURE.validate_json, drawn)))
 
 
 def _files(handle: Handle | None, store: Store) -> dict[str, bytes]:

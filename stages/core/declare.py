@@ -21,9 +21,11 @@ class Facts(TypedDict, total=False):
     """Base of the facts that a stage declares: names and types of what its results' ``meta`` holds.
 
     A module of facts has no ``from __future__ import annotations``, with which ``NotRequired`` would have no effect.
+    ``contradiction``: what the images contradict, in a line; no figure of the run may rest on it.
     """
 
     warnings: list[str]
+    contradiction: str
 
 
 F = TypeVar("F", bound=Mapping[str, Any], default=Mapping[str, Any], covariant=True)

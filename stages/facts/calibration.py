@@ -32,16 +32,12 @@ class OrientationFacts(Facts):
     """Share of the matches that look as well elsewhere on their epipolar lines."""
 
 
-class RigFacts(Facts):
-    """The rig to be used; without a pair that can be used, the first six facts and ``warnings`` alone."""
+class RigFacts(CalibrationFacts):
+    """The rig to be used; without a pair that can be used, the facts that there always are and ``warnings`` alone."""
 
-    rig: dict[str, Any]
-    """To be used, as ``Rig.to_dict`` gives it."""
     given: dict[str, Any]
     mode: str
-    baseline: float
     source: str
-    changed: bool
     parameters: NotRequired[list[dict[str, Any]]]
     """Name, value, asked, sigma, unit, observed, freed, why; in mode ``fixed`` what would be changed."""
     per_pair: NotRequired[list[dict[str, Any]]]
@@ -55,8 +51,6 @@ class RigFacts(Facts):
     """Pairs whose rows the rig does not explain."""
     repeats: NotRequired[str]
     """What the images show repeats, so that matches may be off by a period."""
-    contradiction: NotRequired[str]
-    """A correction that no mount makes."""
     misread: NotRequired[str]
     """By which reading of the lenses' coefficients the matches fit better."""
     knocked: NotRequired[str]
@@ -80,4 +74,3 @@ class SynchronyFacts(Facts):
     """Spread of the rows of each pair, px."""
     partners: list[list[int]]
     """Left and right frame number, of pairs whose images are not of one time."""
-    contradiction: NotRequired[str]

@@ -1,7 +1,7 @@
 """Facts of the stages that compare results with the truth, or with another program's."""
 
 import math
-from typing import Any, NotRequired
+from typing import Any
 
 from rille.stages.core.declare import Facts
 
@@ -22,32 +22,28 @@ def metric(value: Value, unit: str, how: str) -> Metric:
     return {"value": value if value is not None and math.isfinite(value) else None, "unit": unit, "how": how}
 
 
-class AccuracyFacts(Facts):
-    """``metrics`` by name, and the ``frames`` that were compared."""
-
-    metrics: dict[str, Metric]
-    frames: list[int]
-
-
-class DemAccuracyFacts(Facts):
-    """``metrics`` by name; ``window`` x_min, y_min, x_max, y_max, m, that was compared (None: all)."""
-
-    metrics: dict[str, Metric]
-    lattice: dict[str, Any]
-    window: list[float] | None
-
-
 class MetricsFacts(Facts):
     """``metrics`` by name."""
 
     metrics: dict[str, Metric]
-    warnings: NotRequired[list[str]]
 
 
-class DriveCheckFacts(Facts):
-    """``metrics`` by name, and whether the exact map has a path (None: not asked), and one with the margin."""
+class AccuracyFacts(MetricsFacts):
+    """The ``frames`` that were compared."""
 
-    metrics: dict[str, Metric]
+    frames: list[int]
+
+
+class DemAccuracyFacts(MetricsFacts):
+    """``window`` x_min, y_min, x_max, y_max, m, that was compared (None: all)."""
+
+    lattice: dict[str, Any]
+    window: list[float] | None
+
+
+class DriveCheckFacts(MetricsFacts):
+    """Whether the exact map has a path (None: not asked), and one with the margin."""
+
     path_exists: bool | None
     with_margin: bool | None
 
@@ -72,7 +68,7 @@ class JoinFacts(Facts):
     reasons: list[str]
 
 
-class AgreementFacts(Facts):
+class AgreementFacts(MetricsFacts):
     """Disagreement with the crosscheck over ``compared`` frames, the ``rule`` by which they are flagged, its limits.
 
     ``limits`` by array, of angles in degrees; ``flagged`` are frames, and ``why``.
@@ -81,7 +77,6 @@ class AgreementFacts(Facts):
     frames: list[int]
     compared: int
     pieces: int
-    metrics: dict[str, Metric]
     rule: str
     limits: dict[str, float | None]
     flagged: list[dict[str, Any]]

@@ -74,7 +74,6 @@ class ResectFacts(Facts):
 
     per_frame: list[dict[str, Any]]
     intrinsics: dict[str, Any]
-    contradiction: NotRequired[str]
     jump: NotRequired[list[float]]
     knocked: NotRequired[str]
     torn: NotRequired[float]
@@ -95,7 +94,6 @@ class IntrinsicsFacts(Facts):
     corrected: list[float]
     inverse_depth_std: NotRequired[float]
     """Of the error that all inverse depths share by the yaw of a rig that was repaired, 1/m."""
-    contradiction: NotRequired[str]
 
 
 class LoopFacts(Facts):
@@ -144,8 +142,6 @@ class TrajectoryFacts(Facts):
     """Warnings of pairs whose ground contradicts the vertical of their piece."""
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
-    contradiction: NotRequired[str]
-    """Of the camera's motions by another sensor that is used."""
 
 
 class MovingFacts(Facts):

@@ -3,13 +3,12 @@
 from typing import Any, NotRequired
 
 from rille.stages.core.declare import Facts
+from rille.stages.facts.terrain import RasterFacts
 
 
-class RiskFacts(Facts):
+class RiskFacts(RasterFacts):
     """``shares`` of the cells by class, for a ``vehicle`` (:class:`~rille.stages.hazard.vehicle.Vehicle`)."""
 
-    lattice: dict[str, Any]
-    frame: str
     vehicle: dict[str, Any]
     shares: dict[str, float]
 

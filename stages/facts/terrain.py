@@ -37,21 +37,23 @@ class GroundFacts(Facts):
     """Normal, in the left camera's frame, of a plane that most pixels lie on and that is no ground by its attitude."""
     why: NotRequired[str]
     """The reference is a plane that is no ground, though none was asked for."""
-    warnings: NotRequired[list[str]]
-    contradiction: NotRequired[str]
-    """Of the given vertical by the images."""
     seen_up: NotRequired[list[float]]
     """Up, in the left camera's frame, by ground that is seen but contradicts the given vertical."""
 
 
-class DemFacts(Facts):
-    """Elevation model of a basic ``pair`` on a ``lattice`` (its ``to_dict``) of a ``frame``."""
+class RasterFacts(Facts):
+    """Arrays on a ``lattice`` (its ``to_dict``) of a ``frame``."""
 
     lattice: Json
     frame: str
-    pair: int
     reference: NotRequired[str]
     """There where elevations are distances from a plane that is no ground."""
+
+
+class DemFacts(RasterFacts):
+    """Elevation model of a basic ``pair``."""
+
+    pair: int
     z_range: NotRequired[list[float]]
     T_frame_left: NotRequired[list[float]]
     pixel_rad: NotRequired[float]
@@ -66,22 +68,15 @@ class DemFacts(Facts):
     """6 x 6 numbers, row by row: of position, m, and rotation, rad, in the world."""
 
 
-class MergeFacts(Facts):
+class MergeFacts(RasterFacts):
     """Merged tile: its ``pairs``, and the ``defined`` share of its cells."""
 
-    lattice: Json
-    frame: str
     pairs: list[int]
     defined: float
-    reference: NotRequired[str]
-    """There where elevations are distances from a plane that is no ground."""
 
 
-class BoundsFacts(Facts):
+class BoundsFacts(RasterFacts):
     """Bounds of the height of the ground."""
-
-    lattice: Json
-    frame: str
 
 
 class OverlapFacts(Facts):
@@ -97,8 +92,6 @@ class AuditFacts(Facts):
     models: list[Json]
     seam_count: int
     seams: list[Json]
-    contradiction: NotRequired[str]
-    """Of most models by their neighbours."""
 
 
 class RadiometryFacts(Facts):

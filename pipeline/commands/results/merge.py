@@ -91,11 +91,9 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
         write_raster(output / name, {band: np.asarray(values, np.float32)}, lattice, Meaning(unit), first.place)
     for one in sessions:
         print(_line(one))
-    known = np.isfinite(merged.elevation)
-    print(
-        f"{output}: dem.tif, dem_sigma.tif, ortho.tif, merge.json: {int(known.sum())} cells of {lattice.cell:g} m, "
-        f"{int((merged.count > 1).sum())} of several runs"
-    )
+    known, several = int(np.isfinite(merged.elevation).sum()), int((merged.count > 1).sum())
+    cells = f"{known} cells of {lattice.cell:g} m, {several} of several runs"
+    print(f"{output}: dem.tif, dem_sigma.tif, ortho.tif, merge.json: {cells}")
 
 
 def _registered(first: Terrain, other: Terrain) -> Session:
@@ -212,7 +210,5 @@ def _line(one: Session) -> str:
     turned, turn = math.degrees(heading_of(one.pose)), math.degrees(one.sigma[5])
     sigma = f"sigma {', '.join(map(metres, one.sigma[:3]))}, {turn:.2g} degrees; by {one.facts['by']}"
     median, nmad, p95 = (metres(overlap[name], signed=name == "median") for name in ("median", "nmad", "p95"))
-    return (
-        f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); "
-        f"{overlap['cells']:.0f} cells in common: median {median}, NMAD {nmad}, 95 % {p95}"
-    )
+    common = f"{overlap['cells']:.0f} cells in common: median {median}, NMAD {nmad}, 95 % {p95}"
+    return f"{one.terrain.name}: at {x:.4g}, {y:.4g}, {z:.4g} m, turned by {turned:.3f} degrees ({sigma}); {common}"

@@ -160,13 +160,11 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
     alone = [(p.name, p.absent) for p in pairs if p.left.exists() != p.right.exists()]
     out.left_out = alone + [(name, why) for name, both in images.items() if (why := out.take(name, both))]
     if out.left_out and len(out.views) < LEAST_VIEWS:
-        raise InputError(
-            "RIL-961",
-            f"the board of {corners[0]} x {corners[1]} inner corners is of use in {len(out.views)} of {len(images)} "
-            f"pairs, {LEAST_VIEWS} are the least ({told(out.left_out, ': '.join)})",
-            remedy="move the board between pictures, all of it in view and in focus; "
-            "inner corners are one fewer than squares, along each side",
-        )
+        of_use = f"{len(out.views)} of {len(images)} pairs, {LEAST_VIEWS} are the least"
+        text = f"the board of {corners[0]} x {corners[1]} inner corners is of use in {of_use}"
+        remedy = "move the board between pictures, all of it in view and in focus"
+        more = "inner corners are one fewer than squares, along each side"
+        raise InputError("RIL-961", f"{text} ({told(out.left_out, ': '.join)})", remedy=f"{remedy}; {more}")
     return out
 
 
@@ -182,12 +180,10 @@ def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
     # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
     # hundredths; at any resolution and distance.
     if rig.rms > 0.1 * spacing:
-        raise InputError(
-            "RIL-800",
-            f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS, "
-            f"{spacing:.0f} px apart: no flat board, or not the same moment left and right",
-            remedy="give pictures of a chessboard, and its inner corners, e.g. --corners 9x6",
-        )
+        text = f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS"
+        doubt = f"{spacing:.0f} px apart: no flat board, or not the same moment left and right"
+        remedy = "give pictures of a chessboard, and its inner corners, e.g. --corners 9x6"
+        raise InputError("RIL-800", f"{text}, {doubt}", remedy=remedy)
 
 
 def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:

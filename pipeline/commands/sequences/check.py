@@ -93,7 +93,6 @@ class Inspection:
         self.frames = tuple(f for f in frames if f not in self.lost)
         self.levels: Counter[str] = Counter()
         self.broken: set[tuple[int, str]] = set()
-        self.exchanged = self.swapped = False
 
     def say(self, *findings: Finding | None) -> None:
         """Print findings, and count them by level."""
@@ -121,7 +120,8 @@ class Inspection:
         if not whole:
             self.say(judge.judge("matching", "no pair of images is whole", {"whole pairs": 0}))
             return
-        yield from self._first_pair((yield from self._sides(whole)))
+        pair, exchanged = yield from self._sides(whole)
+        yield from self._first_pair(pair, exchanged)
         yield from self._motions()
         if len(whole) > 1:
             yield from self._times(whole)
@@ -169,8 +169,8 @@ class Inspection:
                 text = f"{len(stuck)} {camera} images repeat the one before, first frame {names[stuck[0]]}"
                 yield judge.judge("images", text, {"repeated": len(stuck)})
 
-    def _sides(self, whole: list[int]) -> Generator[Wait, Any, int]:
-        """Whether left and right of some pairs fit each other; the first of these pairs that does."""
+    def _sides(self, whole: list[int]) -> Generator[Wait, Any, tuple[int, bool]]:
+        """Whether left and right of some pairs fit each other: the first pair that does; whether most are exchanged."""
         # With neighbours, since a recorder may exchange the sides of every other pair.
         chosen = sorted({pair for step in spread(list(pairwise(whole)), 3) for pair in step}) or whole
         tests = {pair: self.make.swap_check(pair) for pair in chosen}
@@ -178,14 +178,11 @@ class Inspection:
         facts = {pair: task.ref.meta for pair, task in tests.items() if task.ref is not None}
         unlike = unlike_sides(facts)
         swapped = sum(one["swapped"] for one in facts.values())
-        sides = judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names)
-        self.say(sides)
-        self.exchanged = sides.level == "FAIL"
-        self.swapped = 2 * swapped > len(facts)
-        return next((pair for pair in tests if pair not in unlike), whole[0])
+        self.say(judge.judge_pairs(unlike, len(facts), swapped, self.sequence.frame_names))
+        return next((pair for pair in tests if pair not in unlike), whole[0]), 2 * swapped > len(facts)
 
-    def _first_pair(self, pair: int) -> Steps:
-        """Match one pair, and compare it with the rig."""
+    def _first_pair(self, pair: int, exchanged: bool) -> Steps:
+        """Match one pair, and compare it with the rig, which images of ``exchanged`` sides cannot fit."""
         try:
             disparity, oriented = yield [self.make.disparity(pair), self.make.orientation(pair)]
             arrays = {k: np.asarray(v, np.float64) for k, v in self.store.open(oriented).arrays.items()}
@@ -200,19 +197,17 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
         self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
-        if len(left) and not self.exchanged:
+        if len(left) and not exchanged:
             beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
             self.say(judge.judge_sides(float(beyond.mean())))
-        if not self.swapped:  # which is why rows do not fit
-            self.say(judge.judge_epipolar(oriented.meta))
+        self.say(None if exchanged else judge.judge_epipolar(oriented.meta))
         self.say(judge.judge_repetition(oriented.meta["repeated"]))
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
-        if fitted.ref is None:
-            if not self.exchanged:  # which is why no rig fits
-                self.refused(_cause(fitted), "rig")
-        elif "misread" in fitted.ref.meta:
+        if fitted.ref is None and not exchanged:
+            self.refused(_cause(fitted), "rig")
+        elif fitted.ref is not None and "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 

@@ -55,10 +55,8 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     model = build(rig, run.one("trajectory", last=True), names, segments, images)
     folder.mkdir()
     model.write_text(str(folder))
-    return (
-        f"{model.num_reg_frames()} frames of 2 images, {model.num_points3D()} points, "
-        f"{model.compute_mean_reprojection_error():.2f} px; open it with colmap gui --import_path"
-    )
+    points = f"{model.num_points3D()} points, {model.compute_mean_reprojection_error():.2f} px"
+    return f"{model.num_reg_frames()} frames of 2 images, {points}; open it with colmap gui --import_path"
 
 
 def _segments(bundles: RunArtifacts) -> list[MatchedSegment]:
@@ -112,13 +110,10 @@ def build(
         ours.rig_from_world = pycolmap.Rigid3d(np.array(T_world_left.inverse().matrix34))
         model.add_frame(ours)
         for side, camera in cameras.items():
-            image = pycolmap.Image(
-                # COLMAP's text files end a name at a blank.
-                name=f"{side}/{names.get(frame, f'{frame:06d}.png')}".replace(" ", "_"),
-                keypoints=np.array(seen[frame, side]).reshape(-1, 2),
-                camera_id=camera.camera_id,
-                image_id=number[frame, side],
-            )
+            # COLMAP's text files end a name at a blank.
+            name = f"{side}/{names.get(frame, f'{frame:06d}.png')}".replace(" ", "_")
+            pixels, at = np.array(seen[frame, side]).reshape(-1, 2), number[frame, side]
+            image = pycolmap.Image(name=name, keypoints=pixels, camera_id=camera.camera_id, image_id=at)
             image.frame_id = k
             model.add_image(image)
     for position, elements, colour in points:

@@ -31,10 +31,8 @@ def write_run(folder: Path, run: RunArtifacts) -> str:
     for one in pairs:
         tags = _tags(one)
         for name, bands, unit, words in _products(one):
-            meaning = Meaning(
-                unit, np.nan, {"frame": WORLDS.get(pairs.vertical, FRAME), "unit": unit, "content": words, **tags}
-            )
-            write_bands(folder / f"{one.pair:06d}_{name}.tif", bands, meaning, PROFILE)
+            about = {"frame": WORLDS.get(pairs.vertical, FRAME), "unit": unit, "content": words, **tags}
+            write_bands(folder / f"{one.pair:06d}_{name}.tif", bands, Meaning(unit, np.nan, about), PROFILE)
     return f"XYZ, RNG, RNE, UVW, SLP, RUF and DSP of {pairs.words}"
 
 

@@ -81,19 +81,15 @@ def _mesh(terrain: DemFile, step: int) -> tuple[NDArray[np.float64], NDArray[np.
     quads = np.stack([number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]], axis=-1).reshape(-1, 4)
     a, b, c, d = quads[np.isfinite(z.ravel()[quads]).all(axis=1)].T
     # In glTF the front is the side from which corners run anticlockwise.
-    used, faces = np.unique(
-        np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])]), return_inverse=True
-    )
+    corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([c, b, d])])
+    used, faces = np.unique(corners, return_inverse=True)
     row, col = np.divmod(used, z.shape[1])
     col, row = col * step, row * step
     x, y = terrain.grid.matrix @ [col, row, np.ones(len(used))]
     rows, cols = terrain.grid.values.shape
     # trimesh has v = 0 at the bottom of the texture, and flips it for glTF.
-    return (
-        np.column_stack([x, y, terrain.grid.values[row, col]]),
-        faces.reshape(-1, 3),
-        np.column_stack([(col + 0.5) / cols, 1.0 - (row + 0.5) / rows]),
-    )
+    uv = np.column_stack([(col + 0.5) / cols, 1.0 - (row + 0.5) / rows])
+    return np.column_stack([x, y, terrain.grid.values[row, col]]), faces.reshape(-1, 3), uv
 
 
 def _texture(ortho: Layer) -> Any:

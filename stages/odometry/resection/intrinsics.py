@@ -90,6 +90,36 @@ class CommonErrors(NamedTuple):
     wrong: Floats
 
 
+class Shown(NamedTuple):
+    """What segments show of the calibration, a row each, as information and pull on numbers that may be wrong.
+
+    Attributes
+    ----------
+    information, pull : (s, k, k) and (s, k), on :data:`PRIORS`.
+    yaw : (s, 3), on the rig's yaw, and by how much its pull changes with an error of the toe-in.
+    read_out : (s, 2), on the time from the first to the last row.
+    """
+
+    information: Floats
+    pull: Floats
+    yaw: Floats
+    read_out: Floats
+
+
+def shown_by(segments: Sequence[Bundle[ResectFacts]], sigma: Floats) -> Shown:
+    """The parts of all segments; those that hardly turn count for the toe-in alone, whatever the others are by
+    ``sigma`` (k,)."""
+    parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
+    information = np.array([part["information"] for part in parts]).reshape(-1, k, k)
+    pull = np.array([part["pull"] for part in parts]).reshape(-1, k)
+    # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
+    turning = np.array([part["turn_deg"] >= 4.0 for part in parts], bool)
+    straight = ~turning | (turning.sum() < MIN_SEGMENTS)
+    information[straight], pull[straight] = of_toe_in(information[straight], pull[straight], sigma)
+    yaw, read_out = (np.array([part[name] for part in parts]) for name in ("yaw", "read_out"))
+    return Shown(information, pull, yaw.reshape(-1, 3), read_out.reshape(-1, 2))
+
+
 def common_errors(information: Floats, pull: Floats, sigma: Floats, least: float = MIN_ERROR) -> CommonErrors:
     """Errors that all segments share, by their parts and the priors; a prior that they contradict is left out.
 
@@ -271,26 +301,20 @@ def intrinsics_stage(
     with ``fixed`` the rig keeps its yaw. The yaw is corrected first: while it is wrong, the tracks mislead about the
     cameras.
     """
-    parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
-    information = np.array([part["information"] for part in parts]).reshape(-1, k, k)
-    pull = np.array([part["pull"] for part in parts]).reshape(-1, k)
-    # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
-    turning = np.array([part["turn_deg"] >= 4.0 for part in parts], bool)
-    straight = ~turning | (turning.sum() < MIN_SEGMENTS)
-    information[straight], pull[straight] = of_toe_in(information[straight], pull[straight], params.sigma)
+    shown = shown_by(segments, params.sigma)
     used = Rig.from_dict(rig.meta["rig"])
     focal, upright = used.left.fx, epipolar.standing_right(used)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
-    common = common_errors(information, pull, params.sigma, least=MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR)
+    believed = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
+    common = common_errors(shown.information, shown.pull, params.sigma, believed)
     left = np.append(common.errors[:-1], 0.0)  # poses are corrected for the toe-in
-    yaw_parts = np.array([part["yaw"] for part in parts]).reshape(-1, 3)
     # The common error of disparities is that of a rig whose toe-in is right.
-    yaws = np.column_stack([yaw_parts[:, 0], yaw_parts[:, 1] + common.errors[-1] * yaw_parts[:, 2]])
+    yaws = np.column_stack([shown.yaw[:, 0], shown.yaw[:, 1] + common.errors[-1] * shown.yaw[:, 2]])
     least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
     yaw, turn = alone(yaws, least / focal)
     bend, bent = alone(yaws, MIN_YAW_PX / focal, change=True)
-    read_out, late = alone(np.array([part["read_out"] for part in parts]).reshape(-1, 2), MIN_READ_OUT)
+    read_out, late = alone(shown.read_out, MIN_READ_OUT)
     # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
     late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
@@ -310,7 +334,7 @@ def intrinsics_stage(
         "correction": correction.tolist(),
         "corrected": composed(made, correction).tolist(),
     }
-    if parts and (made[-1] or rig.meta["changed"]):
+    if len(yaws) and (made[-1] or rig.meta["changed"]):
         facts["inverse_depth_std"] = inverse_depth_std(facts["yaw"], used.baseline)
     cameras = contradiction(facts["corrected"][:CORRECTED], sigma, focal)
     off = turn if fixed else made[-1] + turn
