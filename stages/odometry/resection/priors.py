@@ -246,7 +246,7 @@ class Sensors:
             }
             if not clock.determined:
                 self.lines.append(
-                    f"[{name}] the offset of its clock is not determined and is taken as 0: the motion changes too little"
+                    f"[{name}] the offset of its clock is not determined and taken as 0: the motion changes too little"
                 )
             elif abs(clock.late) > max(MIN_SIGMAS * clock.sigma, 0.005):
                 self.lines.append(

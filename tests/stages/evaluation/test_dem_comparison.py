@@ -206,7 +206,7 @@ def test_bins_leave_out_what_is_empty() -> None:
 def test_noise_in_the_slopes_does_not_keep_a_fit_from_its_end(kind: str) -> None:
     def kerbs(x: float, y: float, seed: int) -> Grid:
         empty = grid(np.zeros((300, 100)), cell=0.1, x0=-5.0)
-        across, along = np.moveaxis(empty.centres() + [x, y], -1, 0)
+        across, along = np.moveaxis(np.add(empty.centres(), (x, y)), -1, 0)
         wall = 0.3 / (1.0 + np.exp((3.5 + 0.3 * np.sin(0.4 * along) - np.abs(across)) / 0.15))
         bumps = 0.02 * np.sin(1.3 * across) + 0.01 * np.sin(0.7 * along)
         return Grid(wall + bumps + np.random.default_rng(seed).normal(0.0, 0.005, wall.shape), empty.matrix)
