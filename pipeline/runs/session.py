@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -180,11 +180,18 @@ def perform(
     _point_latest(opened.folder)
     valid = (h.ref for h in opened.graph.nodes if h.ref is not None and h.index not in opened.graph.outdated)
     suspicious = (line for ref in valid for line in ref.meta.get("warnings", ()))
-    # Warnings of tasks and of the report (which follow from several tasks); those of the input came before the run.
-    for line in dict.fromkeys((*suspicious, *report["warnings"])):
-        if line not in opened.view.sequence.warnings:
-            warn(line)
+    for line in unsaid((*suspicious, *report["warnings"]), report["missing"], opened.view.sequence.warnings):
+        warn(line)
     return _summed_up(opened, result, report["missing"])
+
+
+def unsaid(lines: Iterable[str], missing: Iterable[Mapping[str, str]], before: Iterable[str]) -> list[str]:
+    """Warnings of tasks and of the report (which follow from several tasks), each once.
+
+    Without those of the input, which came ``before`` the run, and those that the closing lines repeat as ``missing``.
+    """
+    said = {*before, *(item["what"] for item in missing)}
+    return [line for line in dict.fromkeys(lines) if line not in said]
 
 
 def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:

@@ -22,6 +22,7 @@ from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
@@ -46,6 +47,7 @@ def plan(
     verbose
         Each task with its reason.
     """
+    seq, options, _ = rocrate.resolved(seq, options)
     settled = settings_of_run(seq, options)
     graph, store, config = Graph(), Store(cache_folder(options.cache)), settled.config
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
@@ -142,6 +144,7 @@ def graph(seq: str = "mockup", *, options: Settings = Settings()) -> None:
     seq
         As for reconstruct.
     """
+    seq, options, _ = rocrate.resolved(seq, options)
     settled = settings(seq, options)
     laid_out = Graph()
     dataflow(laid_out, settled.sequence, settled.config, settled.frames)

@@ -23,6 +23,7 @@ from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.export.programs import rocrate
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name_graph
 from rille.pipeline.flow.reconstruction import spread, vertical
@@ -54,6 +55,7 @@ def check(seq: str, *more: str, options: Settings = Settings()) -> int:
 
 
 def _check(seq: str, options: Settings) -> int:
+    seq, options, _ = rocrate.resolved(seq, options)
     settled = settings(seq, options)
     nobody = type(settled.config).model_fields.keys() - unread.CHECKED
     unread.refuse(settled.given, settled.config, nobody, "a check")
