@@ -14,15 +14,14 @@ import os
 import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any
 
 from rille.datasets.text.reading import TABLE, read_text
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.export.read_dem import refuse_irregular
-from rille.pipeline.runs.options import Settings
 from rille.stages.core.errors import InputError
 
 METADATA = "ro-crate-metadata.json"
@@ -123,19 +122,6 @@ class Crate:
     def unlike(self, run: Path) -> list[str]:
         """Results of the crate that differ in a run, or are missing there."""
         return [name for name, digest in self.digests.items() if _sha256(run / name) != digest]
-
-
-Chosen = TypeVar("Chosen", bound=Settings)
-
-
-def resolved(sequence: str, options: Chosen) -> tuple[str, Chosen, Crate | None]:
-    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew."""
-    crate = read(Path(sequence))
-    if crate is None:
-        return sequence, options, None
-    own: dict[str, Any] = {"config": crate.folder / "config.toml", "frames": crate.options.get("--frames", (None,))[-1]}
-    own |= {name: crate.options.get(f"--{name}", ()) for name in ("until", "only") if hasattr(options, name)}
-    return crate.sequence, replace(options, **{n: getattr(options, n) or value for n, value in own.items()}), crate
 
 
 def _sha256(path: Path) -> str:
