@@ -45,7 +45,7 @@ def export(
         laz, ply: one point in each cube of so many metres; 0: all.
     """
     if to not in ("laz", "ply") and (every > 1 or voxel > 0):
-        raise ConfigError("RIL-973", f"--every and --voxel thin points: --to {to} has none", remedy="leave them out")
+        raise ConfigError("RIL-967", f"--every and --voxel thin points: --to {to} has none", remedy="leave them out")
     if output is not None and to in FILES:
         check_output(output, f".{to}")
     folder = lookup.find(run, runs)

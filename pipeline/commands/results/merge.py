@@ -78,7 +78,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     for one, two in combinations(terrains, 2):
         if np.array_equal(one.arrays["elevation"], two.arrays["elevation"], equal_nan=True):
             text = f"{one.name} and {two.name} are one terrain, to the bit, which would count twice"
-            raise InputError("RIL-974", text, remedy="name one of them")
+            raise InputError("RIL-968", text, remedy="name one of them")
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])
     layers = [_layer(0, first.lattice, first.arrays)]

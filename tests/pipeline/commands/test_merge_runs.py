@@ -103,7 +103,7 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
     again = made_run(tmp_path / "again", FIRST)
     for code, one, two in (
         ("RIL-849", a, a),
-        ("RIL-974", a, again),
+        ("RIL-968", a, again),
         ("RIL-327", a, b),
         ("RIL-851", a, coarse),
         ("RIL-615", utm, other),
