@@ -75,9 +75,9 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
         raise ConfigError("RIL-849", "one run alone is merged with nothing", remedy="name two runs of one place")
     check_folder(output, "merge.json")
     first, *others = terrains = [Terrain.of(folder) for folder in dict.fromkeys(folders)]
-    for one, two in combinations(terrains, 2):
-        if np.array_equal(one.arrays["elevation"], two.arrays["elevation"], equal_nan=True):
-            text = f"{one.name} and {two.name} are one terrain, to the bit, which would count twice"
+    for a, b in combinations(terrains, 2):
+        if np.array_equal(a.arrays["elevation"], b.arrays["elevation"], equal_nan=True):
+            text = f"{a.name} and {b.name} are one terrain, to the bit, which would count twice"
             raise InputError("RIL-968", text, remedy="name one of them")
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])

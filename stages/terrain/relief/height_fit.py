@@ -58,6 +58,11 @@ class HeightFit(NamedTuple):
     step: Floats
     rounds: int
 
+    @property
+    def level(self) -> Floats:
+        """The turn (3, 3) of the pose without its heading."""
+        return rotation_exp([0.0, 0.0, -heading_of(self.pose)]) @ self.pose.rotation
+
 
 def condition(normal: Floats) -> float:
     """Least eigenvalue of a normal matrix scaled to a diagonal of ones."""
