@@ -134,7 +134,7 @@ class Sensors:
             return own
         found = laid_on_fixes(positions.fixes(own), own)
         if found is None:
-            self._refuse("positions", f"no piece has {MIN_FIXES} of them")
+            self._refuse("positions", f"no piece has {MIN_FIXES} of them", remedy="give more at the images' times")
             return own
         self.used["positions"] = replace(positions, laid=found[0])
         return found[1]
