@@ -387,7 +387,8 @@ class World(Table):
     pitch_deg : degrees; downward pitch of the left camera's axis over the ground, roll 0.
     up : direction of up in the reference frame of the calibration files (the left camera's where they state none), the
         same for all pairs.
-    crs : projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg.
+    crs : projected CRS in metres of the results, e.g. "EPSG:32633"; with origin and azimuth_deg. Alone: that of
+        [positions] in degrees.
     origin : m; easting, northing and height of the first left camera's centre in that CRS.
     azimuth_deg : degrees clockwise from grid north; heading of the first left camera's optical axis, the world's y
         axis; of a camera within 10 degrees of straight down that of its images' upper edge, up to 30 degrees between.
@@ -403,10 +404,8 @@ class World(Table):
     def _one_vertical_and_a_whole_place(self) -> World:
         if self.up is not None and self.pitch_deg is not None:
             raise ValueError("up and pitch_deg both state the vertical: remove one of them")
-        missing = [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
-        if len(missing) in (1, 2):
-            text = f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing"
-            raise ValueError(f"{text} (a run without all of them, but with [positions], states the latter two)")
+        if (missing := self.missing) and len(missing) < 3 and missing != ["origin", "azimuth_deg"]:
+            raise ValueError(f"a place needs crs, origin and azimuth_deg: {' and '.join(missing)} missing")
         if self.crs is not None and self.origin is not None and are_degrees(self.crs, self.origin):
             text = f"origin = {list(self.origin)} looks like degrees"
             raise ValueError(f"{text}: give easting, northing and height in {self.crs}, metres")
@@ -418,6 +417,11 @@ class World(Table):
             doubt = "are easting and northing exchanged? else give them in a CRS of the place, as UTM"
             raise ValueError(f"{text}: {doubt}")
         return self
+
+    @property
+    def missing(self) -> list[str]:
+        """Keys of the place that are not stated."""
+        return [key for key in ("crs", "origin", "azimuth_deg") if getattr(self, key) is None]
 
     @property
     def place(self) -> Georeference | None:
@@ -462,6 +466,12 @@ class Manifest(Table):
     def _one_rotation(self) -> Manifest:
         if self.attitude is not None and self.imu is not None:
             raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _crs_alone_is_that_of_positions(self) -> Manifest:
+        if self.world.crs is not None and self.world.missing and self.positions is None:
+            raise ValueError("world: a place needs crs, origin and azimuth_deg: origin and azimuth_deg missing")
         return self
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import unicodedata
+import zlib
 
 from rille.stages.core.errors import InputError
 
@@ -33,6 +35,12 @@ def check_name(name: str) -> None:
 
 
 def derived_name(text: str) -> str:
-    """A name made from that of any file or folder."""
-    name = OTHER.sub("_", text).strip("_.-")[:MAX_CHARACTERS].rstrip("_.-")
-    return name if name and name not in RESERVED else "sequence"
+    """A name made from that of any file or folder: letters without their accents.
+
+    Letters of other alphabets are left out; that others remain apart, a checksum of all stands behind.
+    """
+    plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
+    lost = any(c.isalnum() and not c.isascii() for c in plain)
+    mark = f"_{zlib.crc32(text.encode(errors='surrogatepass')):08x}" if lost else ""
+    name = OTHER.sub("_", plain).strip("_.-")[: MAX_CHARACTERS - len(mark)].rstrip("_.-")
+    return f"{name if name and name not in RESERVED else 'sequence'}{mark}"

@@ -10,11 +10,11 @@ from __future__ import annotations
 import re
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
@@ -31,6 +31,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
+from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
@@ -66,6 +67,19 @@ def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     given = read_toml(options.config, "configuration") if options.config else {}
     # --set overrides --config.
     return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
+
+
+Chosen = TypeVar("Chosen", bound=Settings)
+
+
+def resolved(sequence: str, options: Chosen) -> tuple[str, Chosen, rocrate.Crate | None]:
+    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew."""
+    crate = rocrate.read(Path(sequence))
+    if crate is None:
+        return sequence, options, None
+    own: dict[str, Any] = {"config": crate.folder / "config.toml", "frames": crate.options.get("--frames", (None,))[-1]}
+    own |= {name: crate.options.get(f"--{name}", ()) for name in ("until", "only") if hasattr(options, name)}
+    return crate.sequence, replace(options, **{n: getattr(options, n) or value for n, value in own.items()}), crate
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:
@@ -182,11 +196,18 @@ def perform(
     # What the trajectory lacked before it was adjusted is no matter.
     valid = (h for h in opened.graph.nodes if h.index not in outdated and h is not products.chained)
     suspicious = (line for h in valid if h.ref is not None for line in h.ref.meta.get("warnings", ()))
-    # Warnings of tasks and of the report (which follow from several tasks); those of the input came before the run.
-    for line in dict.fromkeys((*suspicious, *report["warnings"])):
-        if line not in opened.view.sequence.warnings:
-            warn(line)
+    for line in unsaid((*suspicious, *report["warnings"]), report["missing"], opened.view.sequence.warnings):
+        warn(line)
     return _summed_up(opened, result, report["missing"])
+
+
+def unsaid(lines: Iterable[str], missing: Iterable[Mapping[str, str]], before: Iterable[str]) -> list[str]:
+    """Warnings of tasks and of the report (which follow from several tasks), each once.
+
+    Without those of the input, which came ``before`` the run, and those that the closing lines repeat as ``missing``.
+    """
+    said = {*before, *(item["what"] for item in missing)}
+    return [line for line in dict.fromkeys(lines) if line not in said]
 
 
 def _summed_up(opened: _Opened, result: driver.Result, missing: list[dict[str, str]]) -> RunResult:

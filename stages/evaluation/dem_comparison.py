@@ -128,7 +128,7 @@ def align(a: Grid, b: Grid, kind: Align, start: RigidTransform = RigidTransform.
     # Cells at a border that come and go from step to step keep the motion changing, but within its own errors.
     if fit.rounds == MAX_ROUNDS and (np.abs(fit.step) > sigma).any():
         text = f"no alignment after {MAX_ROUNDS} steps: the last one still moved by {np.abs(fit.step[:3]).max():.2g} m"
-        remedy = "choose fewer freedoms (tilt or shift), or bring the models closer first"
+        remedy = "choose other freedoms (rigid if one may lean, tilt on flat ground), or bring the models closer first"
         raise DegenerateError("RIL-324", text, remedy=remedy)
     return Alignment(pose, pose.apply(fit.centre), sigma, fit.rounds, int(np.isfinite(fit.differences).sum()))
 

@@ -9,7 +9,8 @@ map's cells, for single cells would differ from the map by their relief and not 
    doi:10.1109/TIP.2011.2181402), which the fast Fourier transform gives for all places of a heading at once.
 2. The best places that are no neighbours are each refined on the map itself
    (:mod:`rille.stages.terrain.relief.height_fit`) with Huber's weights. The slopes are those of the model, whose noise
-   is less than the map's. The tilt has a prior, ``sigma_tilt_deg``.
+   is less than the map's. The tilt has a prior, ``sigma_tilt_deg``. If the best fit tilts the model much, places are
+   sought and refined once more with the model turned by that.
 3. Neighbouring differences are correlated, the more so at a wrong place. With r their correlation at a distance of one
    cell, n cells count for n ((1 - r) / (1 + r))^2 independent ones, in the covariance, too. The chi2 by which a place
    is worse than the best one is this number times the logarithm of the ratio of their mean squares, so that no standard
@@ -33,7 +34,7 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, Params, stage
 from rille.stages.core.errors import DegenerateError, InputError
 from rille.stages.facts.terrain import DemFacts, MapFixFacts
-from rille.stages.geometry.geometry import RigidTransform, cross_matrix, from_above, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, from_above, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.numeric.robust import huber_weight
 from rille.stages.terrain.relief.grid import Grid
@@ -174,11 +175,21 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
         text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
         raise InputError("RIL-840", text, remedy="name a start, or one that is nearer")
     rough = thin(model, coarse.cell)
-    near, fits = NEIGHBOURS * coarse.cell, list[HeightFit]()
-    for start in _search(rough.points, middle, coarse, wide, params.min_overlap):
-        fit = _refined(rough, coarse, start, near, params)
-        fit = fit and _refined(blocks, ground, fit.pose, near, params)
-        fits += [fit] if fit else []
+    near = NEIGHBOURS * coarse.cell
+
+    def fits_from(lean: Floats) -> Iterator[HeightFit]:
+        """Fits at the best places of the model turned by ``lean`` (3, 3)."""
+        for start in _search(rough.points @ lean.T, lean @ middle, coarse, wide, params.min_overlap):
+            fit = _refined(rough, coarse, start @ RigidTransform(lean, np.zeros(3)), near, params)
+            if fit := fit and _refined(blocks, ground, fit.pose, near, params):
+                yield fit
+
+    fits = [*fits_from(np.eye(3))]
+    # The search takes the model as level. A vertical that is off is so everywhere, and found at wrong places, too.
+    first = min(fits, key=lambda fit: fit.square, default=None)
+    # 3.0: times the RMS of the differences; where the tilt lifts the edge by less it hides no place.
+    if first and np.linalg.norm(rotation_log(first.level)) * far > 3.0 * math.sqrt(first.square):
+        fits += fits_from(first.level)
 
     def apart(fit: HeightFit, x: float, y: float, heading: float) -> tuple[float, float]:
         """Distances, m, of the origin from a place, and of the farthest points by the turn alone."""

@@ -111,6 +111,8 @@ def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None
     assert all(hashlib.sha256((crate / name).read_bytes()).hexdigest() == entities[name]["sha256"] for name in parts)
     image = hashlib.sha256(next((place.folder / "other" / "left").iterdir()).read_bytes()).hexdigest()
     assert image in {entities[one["@id"]].get("value") for one in entities["#run"]["object"]}
+    planned = place.rille("plan", crate)
+    assert (planned.status, " 0 to do" in planned.out) == (0, True), planned.out
     again = place.rille("reconstruct", crate, "--jobs", "1", "--runs", runs)
     assert again.status == 0, again.err
     assert re.fullmatch(rf"(\d+) of \1 results are those of {crate}, to the bit", again.last)
@@ -121,12 +123,13 @@ def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None
     assert "RIL-041" in other.err
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "plan", "graph", "check"])
 @pytest.mark.parametrize(
     "content", ["{", '{"@graph": []}', '{"@graph": [{"@id": "#run", "name": "rm -r x", "result": []}]}']
 )
-def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, content: str) -> None:
+def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, content: str, command: str) -> None:
     (tmp_path / "ro-crate-metadata.json").write_text(content)
-    refused = place.here("reconstruct", str(tmp_path))
+    refused = place.here(command, str(tmp_path))
     assert (refused.status, "RIL-023" in refused.complaint) == (2, True)
 
 

@@ -107,6 +107,8 @@ WRONG = {
         ("no-such-run --to laz", "RIL-067"),
         ("runs/other --to colmap", "RIL-067"),
         ("runs/other/latest --to laz -o cloud.ply", "RIL-871"),
+        ("other --to glb --every 4", "RIL-967"),
+        ("other --to frames --voxel 0.1", "RIL-967"),
     ],
     "compare-dem": [
         ("runs/other/latest", "RIL-001"),

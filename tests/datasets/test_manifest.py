@@ -924,15 +924,15 @@ def test_positions_without_a_fix_are_left_out_and_counted(tmp_path, names, rows,
     assert sum("RIL-706" in line for line in s.warnings) == (len(left) < 3)
 
 
+@pytest.mark.parametrize("place", ["", "origin = [1e3, 2e3, 0]\nazimuth_deg = 0\n"])
 @pytest.mark.parametrize("more", ["", 'columns = { time = "time", x = "longitude", y = "latitude" }'])
-def test_positions_in_degrees_are_read_in_metres(tmp_path, more):
+def test_positions_in_degrees_are_read_in_metres(tmp_path, more, place):
     write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude", "0,48.1,9", "1,48.1,9.00001"])
     s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'))
     (x, y), (x1, y1) = s.priors["positions"]["positions"]
     assert (x1 - x, y1 - y) == (pytest.approx(0.744, abs=0.002), pytest.approx(0, abs=1e-3))
     assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32632" in line]
-    world = '[world]\ncrs = "EPSG:32633"\norigin = [1e3, 2e3, 0]\nazimuth_deg = 0\n'
-    text = f'{TIMED}{world}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'
+    text = f'{TIMED}[world]\ncrs = "EPSG:32633"\n{place}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n{more}\n'
     s = opened(write_sequence(tmp_path, text))
     assert s.priors["positions"]["positions"][0][0] < 100e3  # six degrees west of the middle of its zone
     assert [line for line in s.warnings if "RIL-774" in line and "EPSG:32633" in line]

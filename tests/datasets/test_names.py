@@ -42,6 +42,21 @@ def test_usual_names_are_permitted(name):
     assert derived_name(name) == name
 
 
+@pytest.mark.parametrize(
+    ("folder", "name"), [("été", "ete"), ("Süd 2", "Sud_2"), ("day 1 #ä", "day_1_a"), ("latest", "sequence")]
+)
+def test_letters_lose_their_accents(folder, name):
+    assert derived_name(folder) == name
+
+
+@pytest.mark.parametrize("folders", [("東京", "京都"), ("день1", "ночь1"), ("Straße", "Strae")])
+def test_folders_in_other_alphabets_do_not_share_a_name(folders):
+    names = {derived_name(folder) for folder in folders}
+    assert len(names) == 2
+    for name in names:
+        check_name(name)
+
+
 @given(st.text())
 def test_any_folder_gives_a_name(text):
     check_name(derived_name(text))

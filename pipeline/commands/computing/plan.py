@@ -27,7 +27,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
-from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
+from rille.pipeline.runs.session import late, memory_limit, resolved, settings, settings_of_run
 from rille.stages.core.quantities import count, some
 
 
@@ -46,6 +46,7 @@ def plan(
     verbose
         Each task with its reason.
     """
+    seq, options, _ = resolved(seq, options)
     settled = settings_of_run(seq, options)
     graph, store, config = Graph(), Store(cache_folder(options.cache)), settled.config
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
@@ -142,6 +143,7 @@ def graph(seq: str = "mockup", *, options: Settings = Settings()) -> None:
     seq
         As for reconstruct.
     """
+    seq, options, _ = resolved(seq, options)
     settled = settings(seq, options)
     laid_out = Graph()
     dataflow(laid_out, settled.sequence, settled.config, settled.frames)

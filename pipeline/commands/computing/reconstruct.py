@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from rille.pipeline.commands import batch
 from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.engine.plain import warn
-from rille.pipeline.export.programs import rocrate
 from rille.pipeline.runs import session
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
 from rille.stages.core.errors import warning
@@ -39,16 +37,8 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
 
 def _perform(seq: str, options: Options, verb: str = "reconstruct") -> tuple[int, Path]:
     """Run a sequence, or the run of a crate again; return the exit code and the folder of the results."""
-    crate = rocrate.read(Path(seq))
-    if crate is not None:
-        options = replace(
-            options,
-            config=options.config or crate.folder / "config.toml",
-            frames=options.frames or crate.options.get("--frames", (None,))[-1],
-            until=options.until or crate.options.get("--until", ()),
-            only=options.only or crate.options.get("--only", ()),
-        )
-    result = session.perform(seq if crate is None else crate.sequence, options, verb=verb)
+    seq, options, crate = session.resolved(seq, options)
+    result = session.perform(seq, options, verb=verb)
     result.print()
     if crate is None:
         return result.code, result.folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,14 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> None:
         reports = [api.Run(run).report for run in both]
         settings = [dict(dotted(read_toml(run / "config.toml", "configuration"))) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
-    print("\n".join([f"A {lookup.name(one)}", f"B {lookup.name(other)}", *lines]))
+    heads = [f"{letter} {lookup.name(run)}" for letter, run in (("A", one), ("B", other))]
+    print("\n".join([*(head + _frames(report) for head, report in zip(heads, reports, strict=True)), *lines]))
+
+
+def _frames(report: Mapping[str, Any]) -> str:
+    """Which frames of its sequence a run has, in words."""
+    of = report.get("sequence", {})
+    return f"  frames {of['first']} to {of['last']}: {of['frames']} of {of['frames_of_sequence']}" if of else ""
 
 
 def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
@@ -41,12 +49,20 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _tasks(a: Path, b: Path) -> Iterator[str]:
-    """Counts by stage: tasks with another result, and tasks with a result in one run alone, or in neither."""
+    """Counts by stage: tasks with another result, and tasks with a result in one run alone, or in neither.
+
+    Tasks that differ though their inputs do not are where the difference begins: files, parameters or code.
+    """
     ledgers = [lookup.tasks(run) for run in (a, b)]
     # A failed or skipped task has no digest.
     digests = {label: tuple(rows.get(label, {}).get("digest") for rows in ledgers) for label in ledgers[0] | ledgers[1]}
     fates = {label: _fate(*pair) for label, pair in digests.items()}
     total = Counter(fates.values())
+    for label in [name for name, fate in fates.items() if fate == "another result"]:
+        read, also = (rows[label].get("inputs", {}) for rows in ledgers)
+        names = chain.from_iterable(np.ravel(one) for one in read.values())
+        if read == also and all(len({*digests.get(name, ())}) < 2 for name in names):
+            fates[label] = "another result of equal inputs"
     yield f"tasks         {total['the same result']} with the same result, {total['another result']} with another"
     stages = Counter((fate, (ledgers[1] | ledgers[0])[label]["stage"]) for label, fate in fates.items())
     yield from (f"  {stage}: {n} {fate}" for (fate, stage), n in stages.items() if fate != "the same result")
@@ -77,9 +93,15 @@ def _positions(a: Path, b: Path) -> str:
         return "positions     not both runs have a trajectory"
     one, other = (api.Run(run).trajectory for run in (a, b))
     _, rows, others = np.intersect1d(one.time, other.time, return_indices=True)
-    apart = np.linalg.norm(one.position.values[rows] - other.position.values[others], axis=1)
-    apart = apart[np.isfinite(apart)]
-    if not apart.size:
+    posed, also = (np.isfinite(run.position.values).all(axis=1) for run in (one, other))
+    known = posed[rows] & also[others]
+    rows, others, how = rows[known], others[known], ""
+    if not rows.size:
         return "positions     no frame has a pose in both"
+    here, there = one.position.values[rows], other.position.values[others]
+    if one.time[posed][0] != other.time[also][0]:  # the world of each begins at its first frame
+        turn = one.rotation.values[rows[0]] @ other.rotation.values[others[0]].T
+        there, how = (there - there[0]) @ turn.T + here[0], ", the first of them laid on each other"
+    apart = np.linalg.norm(here - there, axis=1)
     rms = metres(float(np.sqrt(np.mean(apart**2))))
-    return f"positions     of {apart.size} frames: RMS {rms}, at most {metres(float(apart.max()))} apart"
+    return f"positions     of {apart.size} frames{how}: RMS {rms}, at most {metres(float(apart.max()))} apart"

@@ -12,6 +12,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import FILES, export_run
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs, cache_folder, check_output
+from rille.stages.core.errors import ConfigError
 
 Form = Literal["laz", "ply", "glb", "frames", "colmap", "nav2", "rocrate"]
 
@@ -43,6 +44,8 @@ def export(
     voxel
         laz, ply: one point in each cube of so many metres; 0: all.
     """
+    if to not in ("laz", "ply") and (every > 1 or voxel > 0):
+        raise ConfigError("RIL-967", f"--every and --voxel thin points: --to {to} has none", remedy="leave them out")
     if output is not None and to in FILES:
         check_output(output, f".{to}")
     folder = lookup.find(run, runs)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,7 +74,11 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
     if len(set(folders)) < 2:
         raise ConfigError("RIL-849", "one run alone is merged with nothing", remedy="name two runs of one place")
     check_folder(output, "merge.json")
-    first, *others = (Terrain.of(folder) for folder in dict.fromkeys(folders))
+    first, *others = terrains = [Terrain.of(folder) for folder in dict.fromkeys(folders)]
+    for a, b in combinations(terrains, 2):
+        if np.array_equal(a.arrays["elevation"], b.arrays["elevation"], equal_nan=True):
+            text = f"{a.name} and {b.name} are one terrain, to the bit, which would count twice"
+            raise InputError("RIL-968", text, remedy="name one of them")
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])
     layers = [_layer(0, first.lattice, first.arrays)]

@@ -30,7 +30,7 @@ from rille.pipeline.flow.selection import spread
 from rille.pipeline.runs import input_checks as judge
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
-from rille.pipeline.runs.session import settings
+from rille.pipeline.runs.session import resolved, settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import glance
@@ -55,6 +55,7 @@ def check(seq: str, *more: str, options: Settings = Settings()) -> int:
 
 
 def _check(seq: str, options: Settings) -> int:
+    seq, options, _ = resolved(seq, options)
     settled = settings(seq, options)
     nobody = type(settled.config).model_fields.keys() - unread.CHECKED
     unread.refuse(settled.given, settled.config, nobody, "a check")

@@ -134,7 +134,7 @@ class Sensors:
             return own
         found = laid_on_fixes(positions.fixes(own), own)
         if found is None:
-            self._refuse("positions", f"no piece has {MIN_FIXES} of them")
+            self._refuse("positions", f"no piece has {MIN_FIXES} of them", remedy="give more at the images' times")
             return own
         self.used["positions"] = replace(positions, laid=found[0])
         return found[1]
@@ -152,6 +152,9 @@ class Sensors:
         for last in (False, False, True, True, True):
             said = {name: one.factors(own, clocks.get(name, Clock()).late) for name, one in self.used.items()}
             groups = {name: factors for name, factors in said.items() if len(factors.ends)}
+            if last:
+                unknown = [name for name in groups if name in clocks and not clocks[name].determined]
+                groups |= {name: _held(groups[name]) for name in unknown}
             if not groups and not known.doubtful.any():
                 return whole, None
             factors = Factors.joined([known, *groups.values(), anchor(own.poses[0])])
@@ -170,7 +173,7 @@ class Sensors:
         clocks = self._clocks(groups, clocks, done, common)
         self._account(groups, clocks)
         if "positions" in groups and isinstance(positions := self.used.get("positions"), PositionPrior):
-            self._locate(done, positions)
+            self._locate(done, positions, _slide(said["positions"], clocks.get("positions", Clock())))
             # A jump of heights looks like a slope.
             if not self._contradicted("positions"):
                 self._level(done)
@@ -224,7 +227,9 @@ class Sensors:
         sigmas, clocks = done.graph.source_sigmas(done.state), dict[str, Clock]()
         for name, factors in groups.items():
             first += factors.shared.shape[2]
-            if self.timed and name != "up":
+            if name in before and not factors.shared[:, :, -1].any():
+                clocks[name] = before[name]
+            elif self.timed and name != "up":
                 late = before.get(name, Clock()).late + OFFSET_SIGMA_S * float(done.state.sources[first - 1])
                 clock = Clock(late, OFFSET_SIGMA_S * float(sigmas[first - 1]))
                 # Taken over where nothing shows it, it would wander from one adjustment to the next.
@@ -240,7 +245,9 @@ class Sensors:
                 "clock_determined": clock.determined,
             }
             if not clock.determined:
-                self.lines.append(f"[{name}] the offset of its clock is not determined: the motion changes too little")
+                self.lines.append(
+                    f"[{name}] the offset of its clock is not determined and taken as 0: the motion changes too little"
+                )
             elif abs(clock.late) > max(MIN_SIGMAS * clock.sigma, 0.005):
                 self.lines.append(
                     f"[{name}] its times are {clock.late:.3f} s late (standard deviation {clock.sigma:.3f} s), which "
@@ -256,8 +263,11 @@ class Sensors:
         # 0.05: share of them; one in a hundred is to be expected.
         return bool(self.facts[name].get("left_out", 0) > 0.05 * self.facts[name].get("measurements", 0))
 
-    def _locate(self, done: Adjusted, prior: PositionPrior) -> None:
-        """State where the world lies in the frame of positions, unless that is given."""
+    def _locate(self, done: Adjusted, prior: PositionPrior, slide: float) -> None:
+        """State where the world lies in the frame of positions, unless that is given.
+
+        ``slide``: standard deviation of the place, m, by a clock that is taken as right.
+        """
         there = (RigidTransform(done.state.R[-1], done.state.C[-1]) @ prior.laid).inverse()
         # The first camera is the origin of a world with a place, though not of one on a plane that is no ground.
         origin, ahead = there.apply(done.state.C[0]), there.rotation[:, 1]
@@ -267,7 +277,10 @@ class Sensors:
         parts = (f"{v:.2f}" if known else "HEIGHT (not measured)" for v, known in zip(origin, told, strict=True))
         named = f"world.origin is [{', '.join(parts)}] and world.azimuth_deg is {azimuth:.2f}"
         if self.georeference is None:
-            self.lines.append(f"[positions] in their frame {named}: state these with world.crs, and maps lie there")
+            unsure = f" (0.1 s of its clock are {slide * 0.1 / OFFSET_SIGMA_S:.2g} m)" if slide else ""
+            self.lines.append(
+                f"[positions] in their frame {named}{unsure}: state these with world.crs, and maps lie there"
+            )
             return
         covariance, R = done.graph.covariance(done.state)[-1], done.state.R[-1]
         # Along the axes of the positions: without heights the place may slide along their vertical, not the world's.
@@ -275,7 +288,7 @@ class Sensors:
         off = float(np.linalg.norm((origin - self.georeference["origin"])[told]))
         turn = math.radians(azimuth) - self.georeference["azimuth"]
         turn = abs(math.remainder(turn, math.tau))
-        apart = off > MIN_SIGMAS * math.sqrt(variances[told].sum())
+        apart = off > MIN_SIGMAS * math.hypot(math.sqrt(variances[told].sum()), slide)
         turned = turn > max(MIN_SIGMAS * math.sqrt(covariance[5, 5]), MIN_LEAN)
         # 1000.0: distance of the world's origin by positions from the stated one, from which on their frame is another
         # one.
@@ -299,6 +312,16 @@ class Sensors:
                 f"{math.degrees(sigma):.2f}) against their vertical, and elevations with it: for level maps state "
                 f"world.up = [{', '.join(f'{v:.4f}' for v in up)}], which is up in the left camera of its first frame"
             )
+
+
+def _held(factors: Factors) -> Factors:
+    """Factors of a sensor whose clock is taken as right: its last source shows in none."""
+    return replace(factors, shared=factors.shared * (np.arange(factors.shared.shape[2]) < factors.shared.shape[2] - 1))
+
+
+def _slide(factors: Factors, clock: Clock) -> float:
+    """Way of the antenna in the standard deviation of a clock that is not determined, m; 0: it is."""
+    return 0.0 if clock.determined else float(np.linalg.norm(factors.shared[:, :3, -1], axis=1).max())
 
 
 def _permitted(alone: float, groups: Collection[str]) -> tuple[Sequence[float], float]:

@@ -58,11 +58,27 @@ class HeightFit(NamedTuple):
     step: Floats
     rounds: int
 
+    @property
+    def level(self) -> Floats:
+        """The turn (3, 3) of the pose without its heading."""
+        return rotation_exp([0.0, 0.0, -heading_of(self.pose)]) @ self.pose.rotation
+
 
 def condition(normal: Floats) -> float:
     """Least eigenvalue of a normal matrix scaled to a diagonal of ones."""
     scale = np.sqrt(np.diag(normal)) + 1e-12
     return float(np.linalg.eigvalsh(normal / np.outer(scale, scale))[0])
+
+
+def steps_to_come(step: Floats, before: Floats) -> float:
+    """How far it is to the end, in steps, by the last step and the one before, both (6,), m.
+
+    Noise of the slopes, and weights that follow the fit, shorten all steps by about one share: they are a geometric
+    series. 1 where the steps are none.
+    """
+    share = float(step @ before) / max(float(before @ before), 1e-24)
+    # 0.9: more would be trusted to a share that is known to some per cent.
+    return 1.0 / (1.0 - min(share, 0.9)) if share > 0.5 else 1.0
 
 
 def lay(points: Floats, normals: Floats, ground: Grid, start: RigidTransform, rules: FitRules) -> HeightFit | None:
@@ -84,8 +100,9 @@ def lay(points: Floats, normals: Floats, ground: Grid, start: RigidTransform, ru
         return None
     own = points[known].mean(axis=0)
     rotation, centre = start.rotation, start.apply(own) - [0.0, 0.0, float(np.median(above[known]))]
-    begin, fit = centre, None
+    begin, fit, before = centre, None, np.zeros(6)
     reach = float(np.hypot(*np.std(points[known][:, :2], axis=0)))
+    metres = np.array([1.0, 1.0, 1.0, reach, reach, reach])
     for rounds in range(1, MAX_ROUNDS + 1):
         q, n = (points - own) @ rotation.T, normals @ rotation.T
         above = q[:, 2] + centre[2] - ground.at((q + centre)[:, :2])
@@ -106,7 +123,8 @@ def lay(points: Floats, normals: Floats, ground: Grid, start: RigidTransform, ru
             tilt = np.concatenate([np.zeros(3), rotation_log(rotation @ level)])
             step[free] = -np.linalg.solve(whole, (J.T @ (weight * r) + held @ tilt)[free])
         fit = HeightFit(pose, centre, np.where(known, above, np.nan), square, normal, step, rounds)
-        moved = float(np.abs(step * [1.0, 1.0, 1.0, reach, reach, reach]).max()) / ground.cell
+        before, step = step, step * steps_to_come(step * metres, before * metres)
+        moved = float(np.abs(step * metres).max()) / ground.cell
         # Across at most a cell: farther, the slopes are others.
         step = step / max(float(np.abs(step[:2]).max()) / ground.cell, 1.0)
         centre, rotation = centre + step[:3], orthonormal(rotation_exp(step[3:]) @ rotation)

@@ -98,10 +98,12 @@ def test_what_is_no_second_session_is_one_line_each(tmp_path: Path) -> None:
     a, b = made_run(tmp_path / "a", FIRST), made_run(tmp_path / "b", Frame(seed=9))
     coarse = made_run(tmp_path / "coarse", FIRST, cell=0.04)
     utm = made_run(tmp_path / "utm", FIRST, Georeference("EPSG:32633", (0.0, 0.0, 0.0), 0.0))
-    other = made_run(tmp_path / "other", FIRST, Georeference("EPSG:32632", (0.0, 0.0, 0.0), 0.0))
-    far = made_run(tmp_path / "far", FIRST, Georeference("EPSG:32633", (900.0, 0.0, 0.0), 0.0))
+    other = made_run(tmp_path / "other", FIRST, Georeference("EPSG:32632", (0.0, 0.0, 0.0), 0.0), noise=2)
+    far = made_run(tmp_path / "far", FIRST, Georeference("EPSG:32633", (900.0, 0.0, 0.0), 0.0), noise=2)
+    again = made_run(tmp_path / "again", FIRST)
     for code, one, two in (
         ("RIL-849", a, a),
+        ("RIL-968", a, again),
         ("RIL-327", a, b),
         ("RIL-851", a, coarse),
         ("RIL-615", utm, other),

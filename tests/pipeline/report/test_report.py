@@ -179,6 +179,15 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     assert "trajectory" not in page_.ids
 
 
+def test_what_is_missing_is_no_warning_besides(tmp_path: Path) -> None:
+    wrong, more = "4 of 6 elevation models contradict their neighbours", "a seam of pair 3 is rough"
+    facts = {"models": [], "seam_count": 0, "seams": [], "warnings": [wrong, more], "contradiction": wrong}
+    made = bundles() | {"overlap_audit": Bundle({}, facts)}
+    told, page_, _, _ = written(tmp_path, view(made, products=products(made)))
+    assert wrong in told["warnings"]
+    assert page_.text.index("Look at this A seam of pair 3 is rough.") > page_.text.index(f"Missing {wrong}")
+
+
 def test_frames_without_a_pose_are_named(tmp_path: Path) -> None:
     made = bundles()
     poses, piece = (made["trajectory"][name].copy() for name in ("poses", "piece"))

@@ -78,3 +78,9 @@ def test_too_few_open_files_are_named_before_anything_is_read(monkeypatch):
     with raises("RIL-276"):
         session.perform("no-such-sequence", session.Options())
     assert asked == [(8192, 100_000)]
+
+
+def test_what_is_said_before_a_run_or_at_its_end_is_no_warning_too() -> None:
+    missing = [{"kind": "contradiction", "what": "models contradict", "why": ""}]
+    lines = ["no IMU", "models contradict", "a blurred frame", "a blurred frame"]
+    assert session.unsaid(lines, missing, ["no IMU"]) == ["a blurred frame"]

@@ -200,3 +200,18 @@ def test_bins_leave_out_what_is_empty() -> None:
     found = binned(np.array([1.0, 3.0, -2.0, np.nan]), np.array([0.5, 0.6, 9.0, 0.1]), np.array([0.0, 1.0, 5.0, 10.0]))
     assert [(f["from"], f["to"], f["cells"]) for f in found] == [(0.0, 1.0, 2), (5.0, 10.0, 1)]
     assert found[0]["bias"] == 2.0
+
+
+@pytest.mark.parametrize("kind", ["shift", "rigid"])
+def test_noise_in_the_slopes_does_not_keep_a_fit_from_its_end(kind: str) -> None:
+    def kerbs(x: float, y: float, seed: int) -> Grid:
+        empty = grid(np.zeros((300, 100)), cell=0.1, x0=-5.0)
+        across, along = np.moveaxis(np.add(empty.centres(), (x, y)), -1, 0)
+        wall = 0.3 / (1.0 + np.exp((3.5 + 0.3 * np.sin(0.4 * along) - np.abs(across)) / 0.15))
+        bumps = 0.02 * np.sin(1.3 * across) + 0.01 * np.sin(0.7 * along)
+        return Grid(wall + bumps + np.random.default_rng(seed).normal(0.0, 0.005, wall.shape), empty.matrix)
+
+    # Each step is shortened by the share of the slopes' noise: more than thirty of them would be needed.
+    found = align(kerbs(0.0, 0.0, 1), kerbs(0.1, 0.5, 2), kind)  # type: ignore[arg-type]
+    assert found.rounds < 20
+    np.testing.assert_allclose(found.pose.translation, [-0.1, -0.5, 0.0], atol=3e-3)

@@ -97,12 +97,19 @@ def test_a_clock_that_is_late_is_found_and_stated(sensor):
     assert np.linalg.norm(errors(out, truth)[:, :3], axis=1).max() < 0.4
 
 
-def test_a_clock_that_no_motion_shows_is_said_not_to_be_determined():
-    truth, rng = winding(turn=0.0, change=0.0), np.random.default_rng(3)
+@pytest.mark.parametrize("seed", range(3, 7))
+def test_a_clock_that_no_motion_shows_is_said_not_to_be_determined_and_is_taken_as_right(seed):
+    truth, rng = winding(turn=0.0, change=0.0), np.random.default_rng(seed)
     segments, before = run_of(truth, rng)
     out = adjusted(segments, before, gnss(truth, rng))
     assert not out.meta["priors"]["positions"]["clock_determined"]
     assert [line for line in out.meta["warnings"] if "not determined" in line]
+    # At 10 m/s a clock that nothing determines would lead the place astray by metres.
+    off = np.subtract(out.meta["priors"]["place"]["origin"], [4.5e5, 5.4e6, 300.0])
+    assert np.linalg.norm(off[:2]) < 0.3
+    stated = {"georeference": {"origin": [4.5e5, 5.4e6, 300.0], "azimuth": -1.0}}
+    late = adjusted(segments, before, gnss(truth, np.random.default_rng(seed), late=0.3) | stated)
+    assert not [line for line in late.meta["warnings"] if "stated place" in line]
 
 
 def rotations(truth, M):
@@ -208,6 +215,8 @@ def test_too_few_positions_contradict_nothing():
     (line,) = (line for line in adjusted(segments, before, few).meta["warnings"] if line.startswith("["))
     assert "is not used: no piece" in line
     assert "contradicts" not in line
+    assert "give more" in line
+    assert "raise sigma" not in line
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -97,6 +97,25 @@ def test_a_tilt_of_the_model_is_estimated_and_does_not_move_it() -> None:
     assert found.pose.rotation[2] == pytest.approx([-math.sin(tilt), math.sin(tilt), math.cos(tilt)], abs=3e-3)
 
 
+@pytest.mark.parametrize("degrees", [2.0, 4.0, 6.0])
+def test_a_tilt_hides_no_place_in_all_of_the_map(degrees: float) -> None:
+    """A long lane whose relief is small beside the heights that the tilt lifts its ends by."""
+    tilt, rng = math.radians(degrees), np.random.default_rng(3)
+    waves = [(*rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6.3)) for _ in range(10)]
+
+    def lane(xy: Floats) -> Floats:
+        x, y = np.moveaxis(xy, -1, 0)
+        return np.asarray(sum(0.03 * np.sin(a * x + b * y + c) for a, b, c in waves) + 0.3 * np.tanh(np.abs(x) - 4.0))
+
+    whole, local = Lattice.snap((-8.0, 8.0, -5.0, 45.0), 0.2), Lattice.snap((-6.0, 6.0, 6.0, 34.0), 0.1)
+    ground = lane(whole.xy()) + 0.02 * np.random.default_rng(0).standard_normal(whole.shape)
+    model = lane(np.add(local.xy(), (0.0, 2.4))) - tilt * local.xy()[..., 1]
+    found = fix(Grid.on(local, model), Grid.on(whole, ground), None, MapLocalizationParams(sigma_tilt_deg=5.0))
+    # The model is higher or lower by the tilt, and so seen shorter.
+    assert found.pose.translation[:2] == pytest.approx([0.0, 2.4], abs=0.15)
+    assert not found.doubt
+
+
 def test_errors_are_of_the_size_that_the_covariance_claims() -> None:
     kept = [0, 1, 2, 5]
     nees = []
