@@ -168,12 +168,8 @@ class Sources:
     def image(self, frame: int, camera: str, T_bed_camera: RigidTransform, sensor: RenderParams) -> Source:
         """Image of a true camera."""
         geometry = self.rig.left if camera == "left" else self.rig.right
-        args = {
-            "frame": frame,
-            "camera": camera,
-            "geometry": geometry.to_dict(),
-            "T_bed_camera": T_bed_camera.to_list(),
-        }
+        args = {"frame": frame, "camera": camera, "geometry": geometry.to_dict()}
+        args["T_bed_camera"] = T_bed_camera.to_list()
         return Source("rille.datasets.mockup.render", sensor, args, inputs=self.inputs)
 
     def disparity(self, frame: int, T_bed_left: RigidTransform) -> Source:
