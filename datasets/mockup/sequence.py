@@ -25,6 +25,7 @@ from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import ConfigError, InputError
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.hazard.vehicle import Vehicle
+from rille.stages.terrain.ground import rounded_cell
 
 FIRST_Y_M = -0.1
 """m, y of the first position in the bed frame: the near edge of the bed lies below the first images."""
@@ -214,7 +215,7 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         defaults={
             "keyframes.rule": "stride",
             "keyframes.stride": 4,
-            "locus.cell_size": 0.001,
+            "locus.cell_size": cell_of(p),
             "intrinsics.prior": EXACT_CALIBRATION,
         },
         notes=(
@@ -223,6 +224,13 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         ),
         parameters={"mockup": p},
     )
+
+
+def cell_of(p: SetupParams) -> float:
+    """Side of a cell, m: 1 mm, or more where two errors of the nearest ground's depth are (0.2 px of disparity)."""
+    half = math.atan(0.5 * p.image_height / p.focal_length)
+    nearest = p.camera_height * math.cos(half) / math.sin(min(math.radians(p.pitch_deg) + half, 0.5 * math.pi))
+    return max(0.001, rounded_cell(2.0 * 0.2 * nearest**2 / (p.focal_length * p.baseline)))
 
 
 def vehicle_at_scale() -> Vehicle:

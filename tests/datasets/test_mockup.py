@@ -347,3 +347,17 @@ def test_bed_challenges_the_rover():
         height = build_scene(p)["height"]
         risk = risk_map(height, np.zeros_like(height), p.cell, seq.mockup(MockupParams(frames=1)).vehicle)["risk"]
         assert 0.05 < (risk == 2).mean() < 0.40
+
+
+@pytest.mark.parametrize(
+    ("given", "cell"),
+    [
+        ({}, 0.001),
+        ({"pitch_deg": 0.0}, 0.001),
+        ({"camera_height": 0.45, "baseline": 0.04, "focal_length": 800.0, "pitch_deg": 35.0}, 0.005),
+        ({"camera_height": 0.45, "baseline": 0.15, "focal_length": 350.0, "image_height": 300}, 0.002),
+    ],
+)
+def test_cells_are_no_finer_than_the_nearest_depths(given: dict[str, float], cell: float) -> None:
+    """Cells of 1 mm of a high camera with a short baseline would leave no ground that is seen well enough."""
+    assert seq.mockup(MockupParams.model_validate(given)).defaults["locus.cell_size"] == cell
