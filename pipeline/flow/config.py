@@ -83,8 +83,8 @@ def stages(*flows: str) -> dict[str, Stage]:
 
     Each stage with parameters has a section.
     """
-    every = {*RECONSTRUCTION, *DRIVE}
-    found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or sorted(every)]
+    every = dict.fromkeys((*RECONSTRUCTION, *DRIVE))
+    found = [vars(importlib.import_module(f"rille.pipeline.flow.{flow}")).values() for flow in flows or every]
     used = [value for values in found for value in values]
     listed = [v if isinstance(v, Stage) else declared(v) for v in used if isinstance(v, Stage | ModuleType)]
     return {stage.name: stage for stage in listed if stage is not None}
