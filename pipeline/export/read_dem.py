@@ -279,7 +279,7 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
         names = crs_name(first), crs_name(second)
         if first != second and set(names) != {own} and CRS.from_user_input(first) != CRS.from_user_input(second):
             text = f"{a} is in {names[0]}, {b} in {names[1]}"
-            remedy = "bring one to the other's system: a raster e.g. by gdalwarp -t_srs, a run by its manifest's [world]"
+            remedy = "bring one to the other's system: a raster by gdalwarp -t_srs, a run by its manifest's [world]"
             if own in names:
                 remedy = "rille localize RUN MAP finds a run's place; state it in the manifest ([world]), and run again"
             raise InputError("RIL-615", text, remedy=remedy)
