@@ -278,7 +278,7 @@ def refuse_unlike_systems(stated: Mapping[str, str]) -> None:
         names = crs_name(first), crs_name(second)
         if first != second and set(names) != {own} and CRS.from_user_input(first) != CRS.from_user_input(second):
             text = f"{a} is in {names[0]}, {b} in {names[1]}"
-            remedy = "bring one to the other's system first, e.g. with gdalwarp -t_srs"
+            remedy = "bring one to the other's system: a raster by gdalwarp -t_srs, a run by its manifest's [world]"
             if own in names:
                 remedy = "rille localize RUN MAP finds a run's place; state it in the manifest ([world]), and run again"
             raise InputError("RIL-615", text, remedy=remedy)
@@ -292,7 +292,7 @@ def no_ground(name: str) -> InputError:
 
 def _of_run(path: Path) -> DemFile:
     if not (path / "dem.tif").is_file():
-        remedy = "give the folder of a finished run, RUNS/sequence/latest, or a GeoTIFF"
+        remedy = "give a GeoTIFF, or a whole run: the report of this one says what it lacks, or was not asked for"
         raise InputError("RIL-635", f"{path} has no dem.tif", remedy=remedy)
     dem, beside = read_raster(path / "dem.tif"), path / "dem_sigma.tif"
     sigma = read_raster(beside, "elevation_std").grid.values if beside.is_file() else None

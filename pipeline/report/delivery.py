@@ -272,7 +272,7 @@ def _path(view: RunView) -> Items:
     if path.meta.get("found"):
         return []
     y = path.meta.get("blocking_y")
-    where = "" if y is None else f"; blocked {y:.3g} m ahead"
+    where = "" if y is None else f"; blocked {abs(y):.3g} m {'ahead of' if y >= 0 else 'behind'} the first camera"
     return [_item("no path", "No path", (path.meta.get("reason") or "the far row cannot be reached") + where)]
 
 

@@ -70,6 +70,19 @@ def test_a_mask_that_somebody_drew_is_not_overwritten(tmp_path):
         mask("mockup-short", output=tmp_path)
 
 
+def test_a_folder_without_a_manifest_is_told_how_to_get_one(tmp_path, capsys):
+    rng, folder = np.random.default_rng(1), tmp_path / "my drive"
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        bonnet = cv2.GaussianBlur(rng.integers(0, 255, (48, 192)).astype(np.uint8), (0, 0), 2)
+        for k in range(6):
+            scene = cv2.GaussianBlur(rng.integers(0, 255, (96, 192)).astype(np.uint8), (0, 0), 2)
+            assert cv2.imwrite(str(folder / side / f"{k}.png"), np.vstack([scene, bonnet]))
+    (folder / "calib.txt").write_text("90 0 95.5 0 0 90 71.5 0 0 0 1 0\n90 0 95.5 -9 0 90 71.5 0 0 0 1 0\n")
+    mask(str(folder), output=tmp_path)
+    assert f"rille init '{folder}' --force writes one" in capsys.readouterr().out
+
+
 def test_a_mask_that_changed_since_is_refused(tmp_path, materialise):
     s = sequence(tmp_path, body())
     source = s.image(0, "left")

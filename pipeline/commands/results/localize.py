@@ -20,7 +20,14 @@ from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import DemFile, crs_name, read_elevation, read_ortho, refuse_unlike_systems
+from rille.pipeline.export.read_dem import (
+    DemFile,
+    crs_name,
+    frames_of,
+    read_elevation,
+    read_ortho,
+    refuse_unlike_systems,
+)
 from rille.pipeline.export.writers import ENGINEERING_CRS, write_json, write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
@@ -109,6 +116,17 @@ def table(placed: Placement) -> Iterator[str]:
         yield f"  {word:10s} {value:.{digits}f} +- {sigma:.{digits}f} {unit}"
 
 
+def for_manifest(placed: Placement, crs: str) -> Iterator[str]:
+    """Lines of a manifest that state the place; none where the map has no code of a CRS, or no height is known."""
+    code, known = CRS.from_user_input(crs).to_epsg() if crs else None, numbers(placed)
+    if code is not None and "z_m" in known:
+        origin = ", ".join(f"{known[name][0]:.4f}" for name in ("x_m", "y_m", "z_m"))
+        # Azimuths go clockwise from north, yaw to the left.
+        azimuth = -known["yaw_deg"][0] % 360.0
+        yield f'\nnext         in the manifest:\n\n[world]\ncrs = "EPSG:{code}"'
+        yield f"origin = [{origin}]\nazimuth_deg = {azimuth:.3f}"
+
+
 def about(figures: Mapping[str, Any]) -> Iterator[str]:
     """Lines on the registration of a place."""
     if "cells" in figures:
@@ -180,6 +198,10 @@ def localize(
         lines += table(found)
     print("\n".join([*lines, *(() if found is None else about(found.figures))]))
     print("wrote        " + "  ".join(map(str, written)))
+    # The origin of a manifest is that of the sequence's first frame.
+    if found is not None and not why and frames_of(folder / "frames.json")["frames"][0]["frame"] == 0:
+        for line in for_manifest(found, crs):
+            print(line)
     return HOLES if why else COMPLETE
 
 

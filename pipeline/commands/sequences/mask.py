@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -54,5 +55,6 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> None:
         print(f"{camera:12s} {100 * body.mean():.1f} % keeps its place in {len(images)} images: {path}")
         written.append(f'{camera} = "{path.resolve()}"')
     if written:
-        print("next         look at the .look.png; then in the manifest:\n\n[masks]")
+        first = f" (rille init {shlex.quote(seq)} --force writes one)" if Path(seq).is_dir() else ""
+        print(f"next         look at the .look.png; then in the manifest{first}:\n\n[masks]")
         print("\n".join(written))

@@ -155,7 +155,7 @@ def adjust_stage(
     chain = chain_factors(links, numbers, row)
     given = [one for bundle in loops for one in bundle.meta["factors"] if one["from"] in row and one["to"] in row]
     stated = measured_alike(stated_factors(given, row), chain, calibration)
-    sensors = Sensors.of(priors or {}, len(frames))
+    sensors = Sensors.of(priors or {}, frames)
     own = OwnTrajectory(out.poses[posed], out.piece[posed], sensors.times[posed], posed)
     sensors.drop_contradicting(own, upright=NO_VERTICAL not in trajectory.meta["verticals"])
     between = Factors.joined([stated, *sensors.relative_factors(own)])

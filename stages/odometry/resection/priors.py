@@ -71,28 +71,29 @@ class Sensors:
     """Other sensors of a trajectory by name; ``lines`` collects what is noticed.
 
     ``times`` (frame,) of all frames; ``timed``: they are seconds, so that clocks are compared; ``georeference``: the
-    place of the world on Earth, where it is stated. ``facts`` of each sensor; ``alone``: the factor on the camera's
-    errors that places seen again ask for.
+    place of the world on Earth, where it is stated; ``first``: number of the run's first frame. ``facts`` of each
+    sensor; ``alone``: the factor on the camera's errors that places seen again ask for.
     """
 
     used: dict[str, Sensor]
     times: Floats
     timed: bool
     georeference: Mapping[str, Any] | None
+    first: int
     lines: list[str] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     alone: float = 1.0
 
     @staticmethod
-    def of(given: Mapping[str, Any], frames: int) -> Sensors:
-        """Read the argument of stage ``adjust``, which has so many frames."""
+    def of(given: Mapping[str, Any], frames: Sequence[int]) -> Sensors:
+        """Read the argument of stage ``adjust``, which has these frames."""
 
         def stacked(name: str, key: str, shape: tuple[int, ...]) -> Floats:
             missing = np.full(shape, np.nan)
             return np.array([missing if one is None else np.reshape(one, shape) for one in given[name][key]])
 
         timed = bool(given.get("timed", False))
-        times, used = np.array(given.get("times", np.arange(frames)), dtype=np.float64), dict[str, Sensor]()
+        times, used = np.array(given.get("times", np.arange(len(frames))), dtype=np.float64), dict[str, Sensor]()
         clock = times if timed else None
         if "odometry" in given:
             stated, poses = given["odometry"], stacked("odometry", "poses", (3, 4))
@@ -105,7 +106,7 @@ class Sensors:
             used["positions"] = PositionPrior.of(given["positions"], clocked=timed)
         if "up" in given:
             used["up"] = VerticalPrior(stacked("up", "directions", (3,)), float(given["up"]["sigma"]))
-        return Sensors(used, times, timed, given.get("georeference"))
+        return Sensors(used, times, timed, given.get("georeference"), frames[0])
 
     def drop_contradicting(self, own: OwnTrajectory, *, upright: bool) -> None:
         """Leave out the sensors that contradict the camera's own chain, and say so; ``upright``: its z is known."""
@@ -275,7 +276,8 @@ class Sensors:
         self.facts["place"] = {"origin": origin.tolist(), "azimuth_deg": azimuth}
         told = np.isfinite(prior.sigma)
         parts = (f"{v:.2f}" if known else "HEIGHT (not measured)" for v, known in zip(origin, told, strict=True))
-        named = f"world.origin is [{', '.join(parts)}] and world.azimuth_deg is {azimuth:.2f}"
+        begin = f" of runs that begin at frame {self.first}" if self.first else ""
+        named = f"world.origin{begin} is [{', '.join(parts)}] and world.azimuth_deg is {azimuth:.2f}"
         if self.georeference is None:
             unsure = f" (0.1 s of its clock are {slide * 0.1 / OFFSET_SIGMA_S:.2g} m)" if slide else ""
             self.lines.append(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,14 @@ def test_a_run_is_found_in_a_map_that_is_turned_mirrored_or_as_fine(
     assert T.rotation == pytest.approx(true.rotation, abs=5e-3)
     row = np.loadtxt(out.with_suffix(".tum"))
     assert row[1:4] == pytest.approx(T.apply([0.1, 0.2, 0.3]))
-    assert "UTM zone 33N" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "UTM zone 33N" in said
+    world = tomllib.loads(said[said.index("[world]") :])["world"]
+    place = Georeference(world["crs"], tuple(world["origin"]), math.radians(world["azimuth_deg"]))
+    assert place.crs == UTM
+    assert place.origin == pytest.approx(T.translation, abs=1e-3)
+    cos, sin = math.cos(place.azimuth), math.sin(place.azimuth)
+    assert T.rotation[:2, :2] == pytest.approx(np.array([[cos, sin], [-sin, cos]]), abs=0.02)
 
 
 def test_flat_ground_has_no_place_and_no_trajectory_is_written(

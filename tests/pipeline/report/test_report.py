@@ -217,9 +217,10 @@ def test_frames_posed_are_counted_alike_all_over_the_report(tmp_path: Path) -> N
     assert [(r["posed"], r["piece"]) for r in facts["frames"]] == [(True, 1)] * 3 + [(False, None)] + [(True, 2)] * 2
 
 
-def test_no_path_says_how_far_ahead_it_is_blocked(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("y", "where"), [(0.63, "0.63 m ahead of"), (-1.12, "1.12 m behind")])
+def test_no_path_says_how_far_ahead_it_is_blocked(tmp_path: Path, y: float, where: str) -> None:
     made = bundles()
-    meta = {"found": False, "reason": "no way through", "blocking_row": 17, "blocking_y": 0.63}
+    meta = {"found": False, "reason": "no way through", "blocking_row": 17, "blocking_y": y}
     meta |= {"length_m": None, "climb_m": None, "max_inclination": None}
     arrays = {**made["path"].arrays, "path": np.empty((0, 3))}
     made["path"] = made["local_path0"] = made["local_path4"] = Bundle(arrays, meta)
@@ -227,7 +228,7 @@ def test_no_path_says_how_far_ahead_it_is_blocked(tmp_path: Path) -> None:
     assert facts["complete"] is True  # an answer, not a hole
     (missing,) = facts["missing"]
     assert missing["kind"] == "no path"
-    assert [fact for fact in ("no way through", "0.63 m ahead") if fact not in missing["why"]] == []
+    assert [fact for fact in ("no way through", f" {where} the first") if fact not in missing["why"]] == []
     assert facts["metrics"]["local_paths"]["value"] == 0
     assert facts["verdict"].startswith("Complete but for")
     assert "path_length" not in facts["metrics"]

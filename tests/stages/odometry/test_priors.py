@@ -112,6 +112,21 @@ def test_a_clock_that_no_motion_shows_is_said_not_to_be_determined_and_is_taken_
     assert not [line for line in late.meta["warnings"] if "stated place" in line]
 
 
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("stated", [None, {"origin": [4.5e5 + 9.0, 5.4e6, 300.0], "azimuth": -1.0}])
+def test_a_place_is_said_to_be_that_of_the_frame_that_a_run_begins_at(first, stated):
+    truth, rng = winding(), np.random.default_rng(8)
+    segments, before = run_of(truth, rng)
+    for segment in segments:
+        for facts in segment.meta["per_frame"]:
+            facts["frame"] += first
+    before.meta["frames"] = [first + frame for frame in before.meta["frames"]]
+    out = adjusted(segments, before, gnss(truth, rng) | {"georeference": stated})
+    (line,) = (line for line in out.meta["warnings"] if "world.origin" in line)
+    assert ("contradict" in line) == (stated is not None)
+    assert ("world.origin of runs that begin at frame 3 is [" in line) == (first > 0)
+
+
 def rotations(truth, M):
     R = [(M.T @ T.rotation @ M).tolist() for T in truth]
     return {**BASE, "attitude": {"rotations": R, "sigma": 0.003}}
