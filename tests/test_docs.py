@@ -132,6 +132,14 @@ def test_what_a_page_prints_runs_slowly(page: Path, tmp_path: Path, cache: Path)
     run_blocks(page, tmp_path, cache, None if where is None else Path(where))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted((DOCS / "gallery").glob("*.py")), ids=name)
+def test_a_script_of_the_gallery_runs(script: Path, tmp_path: Path, cache: Path) -> None:
+    env = {**os.environ, "MPLBACKEND": "agg", "RILLE_CACHE": str(cache)}
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
+
+
 def build(tmp_path: Path, **env: str) -> Path:
     out = tmp_path / "html"
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", tmp_path / "doctrees", DOCS, out]

@@ -30,15 +30,13 @@ run = rille.reconstruct(
 rows = [json.loads(line) for line in (run.folder / "ledger.jsonl").read_text().splitlines()]
 tiles = [row for row in rows if row.get("stage") == "merge"]
 for tile in tiles:
-    print(
-        f"{tile['label']}: models {len(tile['inputs']['dems'])}, writes {tile['bytes'] / 1e6:.1f} MB"
-    )
+    print(f"{tile['label']}: {len(tile['inputs']['dems'])} models, {tile['seconds']:.2f} s")
 
 # %%
-# ``run.terrain`` reads nothing yet: its arrays are dask arrays, a chunk a tile.
+# ``run.terrain`` reads nothing yet. ``chunk()`` makes its arrays dask's, a chunk a tile of the file.
 
-elevation = run.terrain.elevation
-print(elevation.shape, elevation.data.chunks)
+elevation = run.terrain.elevation.chunk()
+print(elevation.shape, elevation.encoding["preferred_chunks"])
 
 # %%
 # A coarse overview is computed chunk by chunk. A window reads its own chunks alone.
