@@ -12,7 +12,8 @@ parameter is freed only if
    point is not the likelier cause, as it is if a single angle departs. If an angle departs, the camera was turned, and
    for the other angles one standard deviation is enough;
 3. it is *worth it*: the change moves rows, or depth, by more than the usual error of a good calibration, or another
-   angle departs and this one contradicts its calibration, too.
+   angle departs and this one contradicts its calibration, too; and it exceeds twice its error, with that of what is
+   held.
 
 All other parameters stay exactly as given. Angles are tested before the direction of the baseline, because mounts turn
 rather than shift.
@@ -57,6 +58,9 @@ do not reduce."""
 MAX_DEPTH_ERROR = 0.03
 """Largest relative depth error that the uncertainty of an observed parameter may cause; a wrong toe-in of a parallel
 rig causes 0.1 and more, of a convergent rig 0.01 to 0.02."""
+
+LEAST_SIGMAS = 2.0
+"""Deviations, with that of what is held, by which a correction has to differ from none."""
 
 MIN_DEPTH_CHANGE = 0.005
 """Relative change of depth from which on a correction is applied, as by ``least_rows``."""
@@ -182,11 +186,20 @@ class _Chooser:
             if sorted(chosen) == before:
                 break
         fit, correction = self._settled(chosen)
+        sure = [i for i in chosen if abs(correction[i]) >= LEAST_SIGMAS * self._sigma(i, chosen, fit)]
+        if sure != chosen:
+            chosen = sure
+            fit, correction = self._settled(chosen)
         if chosen and not self._worth(correction):  # changes that are large enough singly may cancel each other
             chosen = []
             fit, correction = self._settled(chosen)
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
         return Decision(correction, parameters, fit)
+
+    def _sigma(self, i: int, chosen: Sequence[int], fit: OrientationFit) -> float:
+        """Standard deviation of a chosen parameter, radians, with that of what is held."""
+        free = [k in chosen for k in range(RIG)]
+        return math.sqrt(float(consider_covariance(fit, free, self.priors, self._held(list(chosen)))[i, i]))
 
     def _settled(self, chosen: Sequence[int]) -> tuple[OrientationFit, Floats]:
         """The fit with the chosen parameters free, and their correction (5,)."""
@@ -303,11 +316,10 @@ class _Chooser:
         others = [k for k in chosen if k != i]
         asked, observed = self._asked(i, others), self._depth_error(i, others) <= MAX_DEPTH_ERROR or i in chosen
         if i not in chosen:
-            why = self._refusal(i, chosen) or "not worth it: with the others it moves rows and depth by too little"
+            little = "with the others it moves rows and depth by too little, or by less than what is held may be off"
+            why = self._refusal(i, chosen) or f"not worth it: {little}"
             return Parameter(NAMES[i], 0.0, asked.value, asked.sigma, observed, False, why)
-        free = [k in chosen for k in range(RIG)]
-        sigma = math.sqrt(float(consider_covariance(fit, free, self.priors, self._held(chosen))[i, i]))
-        value = float(fit.x[i])
+        sigma, value = self._sigma(i, chosen, fit), float(fit.x[i])
         rows, depth = self._moves(value * np.eye(RIG)[i])
         why = (
             f"contradicted: {abs(asked.value) / asked.sigma:.0f} times the images' own error, without that of what is "
