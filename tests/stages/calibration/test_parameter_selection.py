@@ -153,7 +153,7 @@ def test_direction_of_the_baseline_is_found():
 
 @pytest.mark.parametrize(("sigmas", "kept"), [(2.0, {"baseline_forward"}), (3.5, set())])
 def test_what_is_held_may_explain_a_correction(sigmas, kept, monkeypatch):
-    """Beside a yaw that is held, and may be off, 1.55 +- 0.49 degrees: of such a correction hardly anything is known."""
+    """Beside a yaw that is held, and may be off, it is 1.55 +- 0.49 degrees."""
     monkeypatch.setattr(parameter_selection, "LEAST_SIGMAS", sigmas)
     rig = street_rig()
     true = knocked(rig, yaw_deg=0.8, forward_deg=1.2)
