@@ -329,9 +329,10 @@ class _Chooser:
 
 
 def impossible_share(rig: Rig, pairs: Sequence[PointPairs], fit: OrientationFit) -> float:
-    """Share of the matches, outliers aside, that lie beyond infinity."""
+    """Share of the matches, outliers aside, that lie beyond infinity; 0 where all are outliers."""
     beyond = np.concatenate([beyond_infinity(rig, m.left, m.right) for m in pairs])
-    return float(np.mean(beyond[np.concatenate(fit.weights) > 0] > 1.0))
+    used = beyond[np.concatenate(fit.weights) > 0]
+    return float(np.mean(used > 1.0)) if used.size else 0.0
 
 
 def row_sensitivity(rig: Rig, pairs: Sequence[PointPairs]) -> Floats:

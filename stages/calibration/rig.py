@@ -54,7 +54,13 @@ from rille.stages.geometry.epipolar import (
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.lens import Lens
 from rille.stages.geometry.scale import right_pixels
-from rille.stages.geometry.sides import BeyondInfinityError, exchanged, refuse_impossible, refuse_mirrored
+from rille.stages.geometry.sides import (
+    BeyondInfinityError,
+    exchanged,
+    refuse_exchanged,
+    refuse_impossible,
+    refuse_mirrored,
+)
 from rille.stages.numeric.robust import mad_sigma
 
 
@@ -132,7 +138,10 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     per_pair = [_alone(given, m, decision, params) for m in pairs]
     share = impossible_share(rig, pairs, decision.fit)
     left, right = np.concatenate([m.left for m in pairs]), np.concatenate([m.right for m in pairs])
-    if (share > BEYOND_SHARE or far) and not turned:
+    if turned:
+        # Of a rig whose right camera lies on its side, exchanged images are turned as well.
+        refuse_exchanged(given, left, right)
+    elif share > BEYOND_SHARE or far:
         refuse_impossible(rig, left, right, share)
     elif applied:
         # The correction that mirrored images ask for may look like a knock.

@@ -186,9 +186,12 @@ def _near(rig: Rig, left: Floats, right: Floats) -> int:
 
 def _models(database: Any, starts: Mapping[int, int]) -> list[Any]:
     """Models, each begun with the stereo pair of most near points (``starts``, by the number of the left image) that
-    is in no model yet, as long as it might become the largest."""
+    is in no model yet, as long as it might become the largest.
+
+    No frame may be posed from one start and all from another: a model of one frame says nothing of the next.
+    """
     models, left, most = [], set(starts), 0
-    while len(left) > most:
+    while len(left) > most or (left and most < 2):
         start = max(left, key=lambda number: (starts[number], -number))
         left.discard(start)
         for model in _map(database, (start, start + 1)):

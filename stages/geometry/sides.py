@@ -54,6 +54,21 @@ def refuse_mirrored(rig: Rig, left: Floats, right: Floats, fitting: float) -> No
         raise DegenerateError("RIL-684", text, remedy="mirror them back")
 
 
+def refuse_exchanged(rig: Rig, left: Floats, right: Floats) -> None:
+    """Refuse matches that fit the rig with its sides exchanged, or with its transformation inverted."""
+    swapped, as_given, other_way = exchanged(rig, left, right)
+    inverted = fits(replace(rig, T_right_left=rig.T_right_left.inverse()), left, right)
+    if swapped or likelier(inverted, as_given):
+        share, how = max((other_way, "its sides exchanged"), (inverted, "its transformation inverted"))
+        raise DegenerateError(
+            "RIL-781",
+            f"{share:.0%} of the matches fit the rig with {how}, {as_given:.0%} as given",
+            remedy="check left/right order, they seem swapped, the sign of the baseline, whether its transformation "
+            "leads from right to left, whether the images are mirrored or upside down, and whether the scene repeats "
+            "along the rows (bricks, tiles)",
+        )
+
+
 def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> None:
     """Refuse matches of which most lie beyond infinity (share ``beyond``), or fit the rig mirrored or sides swapped.
 
@@ -72,16 +87,7 @@ def refuse_impossible(rig: Rig, left: Floats, right: Floats, beyond: float) -> N
             "point, is off by that: calibrate anew, and let the images show near ground; if not, left and right are "
             "exchanged, or the sign of the baseline is wrong",
         )
-    inverted = fits(replace(rig, T_right_left=rig.T_right_left.inverse()), left, right)
-    if swapped or likelier(inverted, as_given):
-        share, how = max((other_way, "its sides exchanged"), (inverted, "its transformation inverted"))
-        raise DegenerateError(
-            "RIL-781",
-            f"{share:.0%} of the matches fit the rig with {how}, {as_given:.0%} as given",
-            remedy="check left/right order, they seem swapped, the sign of the baseline, whether its transformation "
-            "leads from right to left, whether the images are mirrored or upside down, and whether the scene repeats "
-            "along the rows (bricks, tiles)",
-        )
+    refuse_exchanged(rig, left, right)
     if beyond > 0.5:
         raise BeyondInfinityError(
             "RIL-375",

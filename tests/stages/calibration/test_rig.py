@@ -287,10 +287,16 @@ def test_images_of_both_cameras_that_are_mirrored_are_named_where_the_rig_is_not
             assert not orient_rig(rig, pairs, RigParams())["changed"]
 
 
-def test_swapped_images_are_named():
-    pairs = [PointPairs(m.pair, m.right, m.left) for m in street(2)]
+@pytest.mark.parametrize("roll", [0.0, 90.0, -60.0])
+@pytest.mark.parametrize("centre", [(0.54, 0.0, 0.0), (0.0, 0.54, 0.0)])
+def test_swapped_images_are_named(centre, roll):
+    camera, rotation = street_rig().left, rotation_exp([0.0, 0.0, np.radians(roll)])
+    camera = replace(camera, width=600, height=600, cx=310.0, cy=290.0)
+    rig = Rig(camera, camera, RigidTransform(rotation, -rotation @ np.array(centre)))
+    pairs = [matches(rig, street_depth, pair=k) for k in range(2)]
+    assert facts(rig, pairs)["warnings"] == []
     with raises("RIL-781"):
-        facts(street_rig(), pairs)
+        facts(rig, [PointPairs(m.pair, m.right, m.left) for m in pairs])
 
 
 @pytest.mark.parametrize("centre", [(0.54, 0.0, 0.0), (-0.54, 0.0, 0.0), (0.0, 0.54, 0.0), (0.4, 0.0, 0.4)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.evaluation import crosscheck
 from rille.stages.evaluation.crosscheck import (
     OVERLAP,
     CrosscheckParams,
@@ -238,3 +240,18 @@ def test_devon_island_is_registered_throughout(data_dir: Any) -> None:
     n = len(inputs["left"])
     out = crosscheck_stage.run(PARAMS, {"frames": list(range(n)), "rig": rig.to_dict()}, inputs)
     assert posed(out["poses"]).sum() == n == 10
+
+
+@pytest.mark.parametrize(("posed_from", "tried"), [(5, [1, 3, 5]), (1, [1]), (7, [1, 3, 5])])
+def test_starts_that_pose_no_other_frame_end_no_search(monkeypatch, posed_from, tried):
+    """Left images 1, 3, 5 of three frames, of fewer and fewer near points; from one of them all frames are posed."""
+    asked = list[int]()
+
+    def mapped(database: Any, start: tuple[int, int]) -> list[Any]:
+        asked.append(start[0])
+        frames = [1, 2, 3] if start[0] == posed_from else [(start[0] + 1) // 2]
+        return [SimpleNamespace(reg_frame_ids=lambda: frames, num_reg_frames=lambda: len(frames))]
+
+    monkeypatch.setattr(crosscheck, "_map", mapped)
+    assert len(crosscheck._models(None, {1: 90, 3: 80, 5: 70})) == len(tried)
+    assert asked == tried
