@@ -77,9 +77,9 @@ def photographs() -> dict[str, tuple[Any, ...]]:
 def judged(
     preset: str, left: Any, right: Any, truth: Any, left_valid: Any = None, right_valid: Any = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Parts (1, N, R, M) x n, absolute errors (n,) and standard deviations (n,) of the matched pixels with truth.
+    """Parts (floor, N, R, M) x n, squared pixels, absolute errors (n,) and standard deviations (n,), pixels.
 
-    Parts are NaN at pixels without texture, which the factors do not describe alone.
+    Of the matched pixels with truth. Parts are NaN at those without texture, which the factors do not describe alone.
     """
     from rille.stages.hfvm import refinement
     from rille.stages.hfvm import stage as hfvm
@@ -89,7 +89,7 @@ def judged(
     original = refinement.standard_deviation
 
     def recording(noise: Any, disparity: Any, keep: Any) -> Any:
-        parts.extend(np.where(keep, p, np.nan) for p in (noise, *refinement.neighbours(disparity, keep)))
+        parts.extend(np.where(keep, p, np.nan) for p in (keep, noise, *refinement.neighbours(disparity, keep)))
         return original(noise, disparity, keep)
 
     refinement.standard_deviation = recording
@@ -99,7 +99,10 @@ def judged(
     finally:
         refinement.standard_deviation = original
     ok = np.isfinite(found.disparity_std) & np.isfinite(truth)
-    x = np.stack([np.ones(ok.sum()), *(np.asarray(part[ok], np.float64) for part in parts)])
+    # Preset fast matches at half the resolution: its parts are squares of pixels twice as large.
+    wide = 1 if parts[0].shape == ok.shape else 2
+    whole = (wide**2 * np.kron(part, np.ones((wide, wide)))[: ok.shape[0], : ok.shape[1]] for part in parts)
+    x = np.stack([part[ok] for part in whole])
     error = np.abs(found.column_disparity - truth)[ok].astype(np.float64)
     return x, error, found.disparity_std[ok].astype(np.float64)
 

@@ -22,6 +22,7 @@ from rille.stages.geometry.lattice import Lattice
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
+import disparity_std
 import gaps
 import hazard_ablation
 import planner_ablation
@@ -114,6 +115,19 @@ def test_matching_spread_of_columns_and_what_is_claimed_for_it() -> None:
     std = np.array([[1.0, 1.5, 1.0, 2.0, 5.0, NONE]])
     figures = judge(matched([[-9.0, -8.0, -7.0, -5.0, 90.0, NONE]], std=std), parallel(np.full((1, 6), 10.0)))
     assert [figures[k] for k in ("nmad", "within_1", "within_2")] == pytest.approx([1.4826 * 2, 1 / 5, 2 / 5])
+
+
+@pytest.mark.parametrize(("preset", "pixel"), [("default", 1), ("fast", 2)])
+def test_parts_of_standard_deviations_add_up_to_them(preset: str, pixel: int) -> None:
+    """Of odd numbers of rows and columns; preset fast computes its parts in pixels twice as large."""
+    grey = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((151, 191)), 1.5)
+    grey = 128.0 + 40.0 * grey / grey.std()
+    x, _, std = disparity_std.judged(preset, grey[:, :-6], grey[:, 6:], np.full((151, 185), -6.0))
+    x, std = x[:, np.isfinite(x).all(axis=0)], std[np.isfinite(x).all(axis=0)]
+    assert std.size > 10000
+    assert (x[0] == pixel**2).all()
+    factors, *_ = np.linalg.lstsq(x.T, std**2, rcond=None)
+    np.testing.assert_allclose(np.sqrt(factors @ x), std, rtol=0.01)
 
 
 def test_matching_locking_to_whole_pixels() -> None:
