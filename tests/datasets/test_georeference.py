@@ -36,7 +36,7 @@ def test_axes_by_hand() -> None:
 @pytest.mark.parametrize(
     ("given", "facts"),
     [
-        ({"crs": "EPSG:32633"}, ("origin and azimuth_deg missing",)),
+        ({"crs": "EPSG:32633", "origin": ORIGIN}, ("azimuth_deg missing",)),
         ({"origin": ORIGIN, "azimuth_deg": 3.0}, ("crs missing",)),
         ({"crs": "EPSG:999999"}, ("crs", "no known")),
         ({"crs": "EPSG:32633", "origin": (47.07, 15.44, 350.0), "azimuth_deg": 3.0}, ("47.07", "degrees", "easting")),

@@ -205,7 +205,7 @@ def test_what_the_data_do_not_determine_is_missing_and_the_rest_is_delivered(col
     report = json.loads((latest / "report.json").read_text())
     failed = [m["what"] for m in report["missing"] if m["kind"] == "failed"]
     assert any(what.startswith("2 of 2 tasks risk failed (world, truth)") for what in failed), failed
-    assert any(what.startswith("3 of 3 tasks risk/local failed (0, 2, 4)") for what in failed), failed
+    assert not [what for what in failed if "local" in what]  # what the map of a pair is too small for is no failure
     assert not report["complete"]
 
     # one model without a cell: the world is made of the others
