@@ -118,7 +118,7 @@ def nothing(name: str) -> Any:
 
 def _of(args: Any, inputs: Any) -> str:
     """What tells the result of a task from those of its like: a digest of its frames, else its first input's."""
-    own = [args[k] for k in ("pair", "frame", "frames", "camera", "lattice", "use") if k in args]
+    own = [args[k] for k in ("pair", "frame", "frames", "camera", "lattice") if k in args]
     first = next(iter(inputs.values()), None)
     first = first[0] if isinstance(first, list) else first
     return (
@@ -139,6 +139,8 @@ def _facts(name: str, args: Any, inputs: Any) -> dict[str, Any]:
         return {"asks": {}, "chain": args["frames"], "lost": [], "unfit": []}
     if name == "intrinsics":
         return {}
+    if name == "rig":
+        return {"per_pair": [{"pair": one.meta["pair"]} for one in inputs["orientations"]]}
     if name == "keyframes":
         n = args["frames"]
         steps = {"displacement": [1.0] * (n - 1), "match_rate": [1.0] * (n - 1)}
