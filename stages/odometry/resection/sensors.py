@@ -21,12 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp, rotation_log
+from rille.stages.geometry.geometry import RigidTransform, cross_matrix, orthonormal, rotation_exp, rotation_log
 from rille.stages.geometry.rigid import compose, motion, posed, standing_out, umeyama
 from rille.stages.odometry.pose_graph import Factors
 
 LEVER_SIGMA_M = 0.05
 """Standard deviation of each component of a stated lever arm."""
+MOUNT_SIGMA = math.radians(1.0)
+"""Standard deviation of a stated mount about each axis of the left camera."""
 OFFSET_SIGMA_S = 0.5
 """Standard deviation of a sensor's clock against the camera's, before anything is known of it."""
 MIN_FIXES = 3
@@ -162,9 +164,12 @@ class RelativePrior:
 
     @property
     def shared_errors(self) -> Sequence[SharedError]:
-        """Scale and turn of dead reckoning."""
+        """Of the mount; of dead reckoning scale and turn as well."""
+        mounts = [SharedError(f"mount about {axis}", math.degrees(MOUNT_SIGMA), " degrees") for axis in "xyz"]
+        if not self.drift:
+            return mounts
         turns = (SharedError(f"turn about {axis}", math.degrees(self.turn), " degrees per metre") for axis in "xyz")
-        return SharedError("scale", 100.0 * self.drift, " %"), *turns
+        return [*mounts, SharedError("scale", 100.0 * self.drift, " %"), *turns]
 
     def _at(self, rows: NDArray[np.intp], shift: float) -> Floats:
         """Poses (n, 3, 4) of some frames by the sensor ``shift`` seconds later."""
@@ -208,25 +213,28 @@ class RelativePrior:
         if self.drift and not np.diff(poses[rows, :, 3], axis=0).any():
             rows = rows[:0]  # errors are shares of ways, and it has gone none
         a, b = rows[:-1], rows[1:]
-        measured = motion(poses, a, b)
-        way, count, clock = np.linalg.norm(measured[:, :, 3], axis=1), len(a), np.zeros((len(a), 6))
+        measured, moves = motion(poses, a, b), motion(own.poses, a, b)
+        # All that errors show in is of the camera: noise of the sensor would look like a scale or a motion of its own.
+        R, ways, count = moves[:, :, :3], moves[:, :, 3], len(a)
+        way, clock = np.linalg.norm(ways, axis=1), np.zeros((count, 6))
         if self.times is not None and count:
             half = 0.5 * float(np.median(np.diff(own.times)))
-            # Of the camera, not of the sensor: the derivative of the sensor's noise would look like a motion.
             before, after = (motion(resampled(own.poses, own.times, s), a, b) for s in (-half, half))
             turned = rotation_log(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
             clock = np.nan_to_num(np.concatenate([after[:, :, 3] - before[:, :, 3], turned], axis=1)) / (2.0 * half)
-        root, used = np.zeros((count, 6, 6)), slice(3, 6)
+        mount = MOUNT_SIGMA * np.concatenate([-cross_matrix(ways), np.eye(3) - R], axis=1)
+        root, used, columns = np.zeros((count, 6, 6)), slice(3, 6), [mount]
         if not self.drift:
-            sigma, shared = np.full((count, 3), self.turn), OFFSET_SIGMA_S * clock[:, :, None]
+            sigma = np.full((count, 3), self.turn)
         else:
             # Dead reckoning at rest is not exact.
             step = np.maximum(way, 0.05 * np.median(way[way > 0]) if count else 0.0)[:, None]
             sigma, used = np.repeat(step * [self.drift, self.turn], 3, axis=1), slice(0, 6)
-            scale = np.concatenate([self.drift * measured[:, :, 3], np.zeros((count, 3))], axis=1)
+            scale = np.concatenate([self.drift * ways, np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)
-            shared = np.concatenate([scale[:, :, None], turns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
+            columns += [scale[:, :, None], turns]
         root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
+        shared = np.concatenate([*columns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
         shared[:, : used.start] = 0.0
         return Factors.of(np.stack([a, b], axis=1), measured, root, sigma.shape[1], shared)
 
