@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError
-from rille.stages.geometry.colmap import pycolmap
 from rille.stages.geometry.geometry import Camera
 from rille.stages.odometry.resection.robust_pose import sampled_pose
 
@@ -39,11 +38,12 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
         return
     # One focal length, as the solver wants it: that of the columns.
     square = (pixels - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
-    zoomed = pycolmap.Camera(model="SIMPLE_PINHOLE", width=camera.width, height=camera.height, params=[camera.fx, 0, 0])
-    found = sampled_pose(square, landmarks, zoomed, bound, frame, focal_length=True)
+    size = {"width": camera.width, "height": camera.height}
+    pinhole = {"model": "SIMPLE_PINHOLE", **size, "params": [camera.fx, 0, 0]}
+    found = sampled_pose(square, landmarks, pinhole, bound, frame, focal_length=True)
     if found is None:
         return
-    agree, larger = found["num_inliers"], zoomed.focal_length / camera.fx - 1.0
+    agree, larger = found[0]["num_inliers"], found[1] / camera.fx - 1.0
     # 0.6: share of those that agree with another focal length from which on that is the cause: of a zoom by 2 % some
     # 0.8, of another vehicle or of the own body, to which a focal length adapts as well, at most 0.35.
     if agree - agreeing < 0.6 * (count - agreeing) or abs(larger) < MIN_CHANGE:
