@@ -84,16 +84,22 @@ def lay_out(graph: Any, paths: dict[str, Path], shape: tuple[int, int]) -> dict[
     return pyramids
 
 
-def table(graph: Any, seconds: float) -> None:
-    """One line a step: tasks, processor seconds, greatest memory of a process until its end."""
-    steps = defaultdict(list)
-    for handle in graph.nodes:
-        if handle.status == "computed":
-            steps[handle.spec.args.get("step", handle.stage)].append(handle)
-    for step, handles in steps.items():
-        peak, total = max(h.took.peak_rss for h in handles) / 1e6, sum(h.took.seconds for h in handles)
-        print(f"{step:12s} {len(handles):4d} tasks {total:8.1f} s   process {peak:6.0f} MB", flush=True)
-    print(f"elapsed {seconds:.0f} s", flush=True)
+def table(graph: Any, store: Any, jobs: int) -> None:
+    """Run; one line a step: tasks, processor seconds, greatest memory of a process until its end."""
+    from rille.pipeline.engine.events import read
+    from rille.pipeline.engine.run import RunOptions, run
+
+    ledger, steps = store.root / "ledger.jsonl", defaultdict(list)
+    result = run(graph, store, RunOptions(jobs=jobs, ledger=ledger))
+    result.check()
+    names = {h.label: h.spec.args.get("step", h.stage) for h in graph.nodes}
+    for row in read(ledger):
+        if row["status"] == "computed":
+            steps[names[row["label"]]].append(row)
+    for step, rows in steps.items():
+        peak, total = max(row["peak_rss"] for row in rows) / 1e6, sum(row["seconds"] for row in rows)
+        print(f"{step:12s} {len(rows):4d} tasks {total:8.1f} s   process {peak:6.0f} MB", flush=True)
+    print(f"elapsed {result.seconds:.0f} s", flush=True)
 
 
 def judge(store: Any, ref: Any, shape: tuple[int, int]) -> None:
@@ -124,14 +130,6 @@ def compare(store: Any, whole: Any, tiled: Any) -> None:
     print(f"within .01 px of the pair matched whole: {100 * same.mean():.3f} %")
 
 
-def run(graph: Any, store: Any, jobs: int) -> float:
-    from rille.pipeline.engine.run import RunOptions, run
-
-    result = run(graph, store, RunOptions(jobs=jobs))
-    result.check()
-    return float(result.seconds)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--preset", default="default")
@@ -156,7 +154,7 @@ def main() -> None:
         paths = make_pair(Path(folder), shape)
         graph = Graph()
         lay_out(graph, paths, shape)
-        table(graph, run(graph, store, options.jobs))
+        table(graph, store, options.jobs)
         side = tiles.side(
             tiles.Tiling(tile=options.tile, memory=options.memory), params, PyramidParams(), (shape, shape)
         )
@@ -171,10 +169,10 @@ def main() -> None:
         if side is not None:
             other = Graph()
             tiled = tiles.build(other, params, lay_out(other, paths, shape), shape, side, "hfvm")
-            table(other, run(other, store, options.jobs))
+            table(other, store, options.jobs)
             judge(store, tiled.ref, shape)
         if whole is not None:
-            table(graph, run(graph, store, 1))
+            table(graph, store, 1)
             if side is not None:
                 compare(store, whole.ref, tiled.ref)
 

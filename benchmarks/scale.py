@@ -269,6 +269,7 @@ class Watch(threading.Thread):
 def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict[str, Any]:
     """One cold run, one plan of what is cached, or one warm run a day later, in this process."""
     from rille.pipeline.engine.code_digest import tree_digest
+    from rille.pipeline.engine.events import read
     from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
 
@@ -289,7 +290,7 @@ def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict
     watch.stop()
     cpu -= watch.own
     n = len(graph.nodes)
-    processor = sum(h.took.kernel for h in graph.nodes)
+    processor = sum(row.get("kernel", 0.0) for row in read(ledger))
     return {
         "nodes": n,
         "computed": result.counts["computed"],

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine.graph import Handle
+from rille.pipeline.engine.graph import Handle, Took
 from rille.pipeline.engine.runtime.atomic import named
 from rille.pipeline.engine.spec import map_ports
 
@@ -26,7 +26,7 @@ class Ledger:
         # Line by line: what a killed run had done by then is in the file.
         self._file = (path or Path(os.devnull)).open("w", encoding="utf-8", buffering=1)
 
-    def write(self, handle: Handle) -> None:
+    def write(self, handle: Handle, took: Took) -> None:
         """Write the outcome of a node: sources of its inputs, reason of the cache miss, what it took."""
         row: dict[str, Any] = {
             "label": handle.label,
@@ -38,9 +38,9 @@ class Ledger:
             "digest": handle.ref and handle.ref.digest,
             "error": handle.error and {"type": type(handle.error).__name__, "message": str(handle.error)},
         }
-        took = asdict(handle.took) if handle.status == "computed" else {}
-        took = {name: round(value, 4) if isinstance(value, float) else value for name, value in took.items()}
-        self._line({name: value for name, value in row.items() if value} | took)
+        figures = asdict(took) if handle.status == "computed" else {}
+        figures = {name: round(value, 4) if isinstance(value, float) else value for name, value in figures.items()}
+        self._line({name: value for name, value in row.items() if value} | figures)
 
     def note(self, label: str, status: str, reason: str) -> None:
         """Write a line about a flow that could not go on."""

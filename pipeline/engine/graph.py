@@ -48,8 +48,7 @@ class Handle(Generic[F]):
     ``status`` is ``pending``, ``computed``, ``cached``, ``failed``, ``skipped`` or, when dry, ``planned``.
     ``reason`` says in words why it was not in the cache, or was skipped; ``cause`` is the label of the input that
     caused this. ``earlier``, of a planned node, is the artifact of the same label in an earlier run, whose facts the
-    plan assumes. ``expect`` are decoded bytes that it reads besides its inputs, as from a file. ``took``: time and
-    memory of a computed node.
+    plan assumes. ``expect`` are decoded bytes that it reads besides its inputs, as from a file.
     """
 
     index: int
@@ -62,7 +61,6 @@ class Handle(Generic[F]):
     cause: str = ""
     key: str = ""
     expect: float = 0.0
-    took: Took = Took()
     error: BaseException | None = None
 
     @property

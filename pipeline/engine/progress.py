@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 from rille.pipeline.engine.plain import plain, raw
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.graph import Handle, Took
 
 INTERVAL = 5.0
 """Seconds between plain lines."""
@@ -36,8 +36,8 @@ class Progress:
     def open(self) -> None:
         """The run begins."""
 
-    def resolved(self, handle: Handle, total: int) -> None:
-        """The outcome of a node is known, of so many that are known and wanted by now."""
+    def resolved(self, handle: Handle, total: int, took: Took) -> None:
+        """The outcome of a node is known, and what it took, of so many that are known and wanted by now."""
         self.done += 1
 
     def failed(self, label: str, error: BaseException) -> None:
@@ -50,11 +50,11 @@ class Progress:
 class Lines(Progress):
     """A line every few seconds, and one for each failure: for logs."""
 
-    def resolved(self, handle: Handle, total: int) -> None:
+    def resolved(self, handle: Handle, total: int, took: Took) -> None:
         """Say at once what was compiled, and show where the run is."""
-        super().resolved(handle, total)
-        if handle.took.compiling >= 1.0:
-            self._say(f"{handle.stage}: compiling, once: {handle.took.compiling:.0f} s")
+        super().resolved(handle, total, took)
+        if took.compiling >= 1.0:
+            self._say(f"{handle.stage}: compiling, once: {took.compiling:.0f} s")
         self._show(handle, total)
 
     def _show(self, handle: Handle, total: int) -> None:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import heapq
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Collection
@@ -34,7 +33,7 @@ from typing import Any
 from rille.pipeline.engine import memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Graph, Handle, Waiting
+from rille.pipeline.engine.graph import Graph, Handle, Took, Waiting
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
@@ -330,11 +329,12 @@ class _Run:
         workers.scale(jobs)
         return workers
 
-    def _resolve(self, handle: Handle, status: str) -> None:
-        handle.status = status
-        self.ledger.write(handle)
+    def _resolve(self, handle: Handle, status: str, took: Took | None = None) -> None:
+        handle.status, took = status, took or Took()
+        self.ledger.write(handle, took)
         if handle.index not in self.before:  # a task that was computed again counts once
-            self.progress.resolved(handle, len(self.graph.nodes if self.graph.cut is None else self.graph.needed))
+            known = self.graph.nodes if self.graph.cut is None else self.graph.needed
+            self.progress.resolved(handle, len(known), took)
 
     def _skip(self, handle: Handle, missing: Handle) -> None:
         planned, handle.ref = missing.status == "planned", None
@@ -374,9 +374,8 @@ class _Run:
             self._fail(handle, Failed(not_deterministic(handle.stage, handle.label)))
             return
         # Unpickling makes a new object of each name: one for all saves memory.
-        handle.took = replace(outcome.took, worker=sys.intern(outcome.took.worker))
         handle.ref, handle.key = replace(outcome.ref, stage=handle.stage), outcome.ref.key
-        self._resolve(handle, "cached" if outcome.cached else "computed")
+        self._resolve(handle, "cached" if outcome.cached else "computed", outcome.took)
 
     def _culprit(self, handle: Handle, died: Died) -> RilleError:
         """The error of a task that ran alone as its workers died: out of memory, or a crash in native code."""

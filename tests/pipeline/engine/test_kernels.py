@@ -176,8 +176,7 @@ def test_a_run_says_what_it_compiled():
     shown = progress.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
     shown.open()
-    shown.resolved(handle, 2)
+    shown.resolved(handle, 2, Took())
     assert stream.getvalue() == ""
-    handle.took = Took(compiling=31.2)
-    shown.resolved(handle, 2)
+    shown.resolved(handle, 2, Took(compiling=31.2))
     assert "31 s" in stream.getvalue()
