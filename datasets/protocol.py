@@ -151,8 +151,9 @@ class Sequence:
         the same for all frames, and only differences between frames are used. None where it is not known.
     imu_axes : R_imu_left, where ``up`` and ``attitude`` are those of an IMU.
     odometry : T_odometry_left of each frame by dead reckoning, metres; part of the result only as a prior.
-    priors : sensors that the trajectory is adjusted to, and how good they are: ``odometry`` (drift, turn),
-        ``attitude`` and ``up`` (sigma, rad), ``positions`` (positions, times, sigma, lever).
+    priors : sensors that the trajectory is adjusted to, and how good they are: ``odometry`` (drift, turn; of wheels on
+        a plane its ``up`` and the ``origin``, m, of their body in the left camera's frame), ``attitude`` and ``up``
+        (sigma, rad), ``positions`` (positions, times, sigma, lever).
     pitch : downward pitch of the left camera's optical axis, radians, stated with the rig; roll 0.
     georeference : where the world frame lies, where that is known.
     vehicle : the vehicle whose limits suit the scale of the sequence.

@@ -285,10 +285,12 @@ class MotionReader:
 
     def odometry(self, section: model.Odometry) -> None:
         """Read dead reckoning, which is a measurement if its accuracy is stated."""
-        self.state(odometry=self.poses(section, "odometry"))
+        poses = self.poses(section, "odometry")
+        self.state(odometry=poses)
         if section.drift is not None and section.turn_deg is not None:
-            sigmas = {"drift": section.drift, "turn": math.radians(section.turn_deg)}
-            self.state(priors={**self.sequence.priors, "odometry": sigmas})
+            stated: dict[str, Any] = {"drift": section.drift, "turn": math.radians(section.turn_deg)}
+            stated |= _plane(poses, section.T_body_left or RigidTransform.identity())
+            self.state(priors={**self.sequence.priors, "odometry": stated})
 
     def true_positions(self, section: model.Truth, found: TimedPositions) -> protocol.Positions:
         """True positions, without rotations."""
@@ -425,3 +427,15 @@ def _counts(rows: Sequence[Sequence[str]]) -> bool:
     steps = np.diff(np.array(cells, dtype=float), axis=0)
     counted = float(cells[0][0]) in (0, 1) and (steps[:, 0] == 1).all() and (steps[:, 1] > 0).all()
     return bool(counted and (float(cells[0][1]) > 1e8 or (steps[:, 1] != 1).any()))
+
+
+def _plane(poses: Poses, T_body_left: RigidTransform) -> dict[str, list[float]]:
+    """Of poses of a body that never leaves a plane, as of wheels: ``up`` of the plane, and the body's ``origin`` [m],
+    in the left camera's frame; else empty."""
+    known = [pose for pose in poses if pose is not None]
+    ups = np.array([pose.rotation[2] for pose in known])
+    origin = T_body_left.inverse().translation
+    heights = [pose.apply(origin)[2] for pose in known]
+    if len(known) < 2 or np.ptp(ups, axis=0).max() > 1e-6 or np.ptp(heights) > 1e-6:
+        return {}
+    return {"up": ups[0].tolist(), "origin": origin.tolist()}

@@ -89,6 +89,12 @@ class Factors:
         return Factors(**{name: value[chosen] for name, value in vars(self).items()})
 
     @property
+    def motions(self) -> Floats:
+        """Poses (m, 3, 4) of b in the frame of a, also where those of a point beside b are measured."""
+        place = self.poses[:, :, 3] - np.einsum("mij,mj->mi", self.poses[:, :, :3], self.lever)
+        return np.concatenate([self.poses[:, :, :3], place[:, :, None]], axis=2)
+
+    @property
     def doubtful(self) -> Bools:
         """Which (m,) are no part of the chain."""
         return np.isfinite(self.bound)

@@ -899,8 +899,28 @@ sigma_deg = 0.5
         "sigma": [0.1, 0.2, 0.3],
         "lever": [1.0, 2.0, 3.0],
     }
-    assert priors["odometry"] == {"drift": 0.02, "turn": pytest.approx(math.radians(1.0))}
+    plane = {"up": [0.0, 0.0, 1.0], "origin": [0.0, 0.0, 0.0]}
+    assert priors["odometry"] == {"drift": 0.02, "turn": pytest.approx(math.radians(1.0)), **plane}
     assert priors["attitude"] == priors["up"] == {"sigma": pytest.approx(math.radians(0.5))}
+
+
+@pytest.mark.parametrize(
+    ("names", "last", "plane"),
+    [
+        ("time,x,y,yaw_deg", "2,0.2,0.1,5", True),
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0,5", True),
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0.01,5", False),
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,5", False),
+    ],
+)
+def test_wheels_that_never_leave_a_plane_measure_neither_slopes_nor_tilts(tmp_path, names, last, plane):
+    still = ["0," + ",".join("0" for _ in names.split(",")[1:]), "1," + ",".join("0" for _ in names.split(",")[1:])]
+    write_lines(tmp_path / "wheels.csv", [names, *still, last])
+    mount = "[[0, 0, 1, 0.4], [-1, 0, 0, 0], [0, -1, 0, 0.9]]"  # looks ahead, 0.9 m above the axle
+    text = f'[odometry]\nfile = "wheels.csv"\ndrift = 0.02\nturn_deg = 1.0\nT_body_left = {mount}\n'
+    stated = opened(write_sequence(tmp_path, TIMED + text)).priors["odometry"]
+    found = (stated["up"], stated["origin"]) if "up" in stated else None
+    assert found == ((pytest.approx([0, -1, 0]), pytest.approx([0, 0.9, -0.4])) if plane else None)
 
 
 E = "431000,5411000,100"

@@ -105,7 +105,9 @@ def join(own: OwnTrajectory, factors: Factors, sure: Bools) -> OwnTrajectory:
             rows = np.flatnonzero((pieces == [first, other]).all(1))
             here = factors.take(rows)
             graph = PoseGraph(here, len(poses), np.ones(len(rows)))
-            laid = [_moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.poses, strict=True)]
+            laid = [
+                _moved(poses, piece == other, ends, pose) for ends, pose in zip(here.ends, here.motions, strict=True)
+            ]
             states = (GraphState.of(one, here.shared.shape[2]) for one in laid)
             squares = np.array([(graph.errors(state) ** 2).sum(1) for state in states])
             joins = sure[rows] | ((squares <= EXCESS[-1] ** 2 * here.bound).sum(1) > 1)

@@ -29,6 +29,8 @@ LEVER_SIGMA_M = 0.05
 """Standard deviation of each component of a stated lever arm."""
 MOUNT_SIGMA = math.radians(1.0)
 """Standard deviation of a stated mount about each axis of the left camera."""
+TILT_SIGMA = 0.2
+"""Standard deviation, rad, of the ground's slope, and of its change: what odometry on a plane does not measure."""
 OFFSET_SIGMA_S = 0.5
 """Standard deviation of a sensor's clock against the camera's, before anything is known of it."""
 MIN_FIXES = 3
@@ -154,13 +156,16 @@ class RelativePrior:
 
     ``times`` (frame,), s, None: its clock is the camera's. ``drift`` is the standard deviation of its ways as a share
     of them, 0: it measures no ways; ``turn`` that of its rotations, rad, of an attitude for each, of dead reckoning for
-    each metre of way.
+    each metre of way. Of wheels on a plane, which know neither slopes nor tilts, ``up`` (3,) is their vertical in the
+    left camera's frame, else zero; ``origin`` (3,), m, in that frame is the point whose ways are measured.
     """
 
     poses: Floats
     times: Floats | None
     drift: float
     turn: float
+    up: Floats = field(default_factory=lambda: np.zeros(3))
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
 
     @property
     def shared_errors(self) -> Sequence[SharedError]:
@@ -170,6 +175,10 @@ class RelativePrior:
             return mounts
         turns = (SharedError(f"turn about {axis}", math.degrees(self.turn), " degrees per metre") for axis in "xyz")
         return [*mounts, SharedError("scale", 100.0 * self.drift, " %"), *turns]
+
+    def _ways(self, moves: Floats) -> Floats:
+        """Ways (m, 3), m, of the measured point by motions (m, 3, 4) of the left camera, in its frame before."""
+        return moves[:, :, 3] + (moves[:, :, :3] - np.eye(3)) @ self.origin
 
     def _at(self, rows: NDArray[np.intp], shift: float) -> Floats:
         """Poses (n, 3, 4) of some frames by the sensor ``shift`` seconds later."""
@@ -192,14 +201,15 @@ class RelativePrior:
         if not len(a):
             return 0.0, ""
         if self.drift:
-            ways = moves[:, :, 3]
+            level = np.eye(3) - np.outer(self.up, self.up)
+            ways, stated = self._ways(moves) @ level, self._ways(said) @ level
             # 3.0: noise of two positions of the camera up to which it may be at rest, where ways by other sensors mean
             # nothing.
             if np.sqrt((ways**2).sum(1).mean()) < 3.0 * math.sqrt(2.0) * _noise(own):
                 return 0.0, ""
             # A turn that grows along the way leads it aside by half as much.
             allowed = self.drift + 0.5 * self.turn * float(np.linalg.norm(ways, axis=1).mean())
-            return departure(ways, said[:, :, 3], CAMERA_SHARE + MIN_SIGMAS * allowed, "ways")
+            return departure(ways, stated, CAMERA_SHARE + MIN_SIGMAS * allowed, "ways")
         turns = rotation_log(moves[:, :, :3])
         size = math.sqrt(float((turns**2).sum(1).mean()))
         if size < MIN_TURN:
@@ -215,28 +225,34 @@ class RelativePrior:
         a, b = rows[:-1], rows[1:]
         measured, moves = motion(poses, a, b), motion(own.poses, a, b)
         # All that errors show in is of the camera: noise of the sensor would look like a scale or a motion of its own.
-        R, ways, count = moves[:, :, :3], moves[:, :, 3], len(a)
-        way, clock = np.linalg.norm(ways, axis=1), np.zeros((count, 6))
+        ways, count, clock = self._ways(moves), len(a), np.zeros((len(a), 6))
+        way = np.linalg.norm(ways, axis=1)
         if self.times is not None and count:
             half = 0.5 * float(np.median(np.diff(own.times)))
             before, after = (motion(resampled(own.poses, own.times, s), a, b) for s in (-half, half))
             turned = rotation_log(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
-            clock = np.nan_to_num(np.concatenate([after[:, :, 3] - before[:, :, 3], turned], axis=1)) / (2.0 * half)
-        mount = MOUNT_SIGMA * np.concatenate([-cross_matrix(ways), np.eye(3) - R], axis=1)
-        root, used, columns = np.zeros((count, 6, 6)), slice(3, 6), [mount]
+            clock = np.nan_to_num(np.concatenate([self._ways(after) - self._ways(before), turned], axis=1)) / (
+                2.0 * half
+            )
+        mount = MOUNT_SIGMA * np.concatenate([-cross_matrix(ways), np.eye(3) - moves[:, :, :3]], axis=1)
+        root, columns = np.zeros((count, 6, 6)), [mount]
         if not self.drift:
-            sigma = np.full((count, 3), self.turn)
+            root[:, 3:, 3:] = np.eye(3) / self.turn
         else:
             # Dead reckoning at rest is not exact.
-            step = np.maximum(way, 0.05 * np.median(way[way > 0]) if count else 0.0)[:, None]
-            sigma, used = np.repeat(step * [self.drift, self.turn], 3, axis=1), slice(0, 6)
+            step = np.maximum(way, 0.05 * np.median(way[way > 0]) if count else 0.0)[:, None, None]
+            steep = np.outer(self.up, self.up)
+            tilted = np.eye(3) * (self.up @ self.up) - steep
+            root[:, :3, :3] = (np.eye(3) - steep) / (self.drift * step) + steep / (TILT_SIGMA * step)
+            root[:, 3:, 3:] = (np.eye(3) - tilted) / (self.turn * step) + tilted / TILT_SIGMA
             scale = np.concatenate([self.drift * ways, np.zeros((count, 3))], axis=1)
-            turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * way[:, None, None] * np.eye(3)], axis=1)
+            turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * step * np.eye(3)], axis=1)
             columns += [scale[:, :, None], turns]
-        root[:, used, used] = np.eye(sigma.shape[1]) / sigma[:, None, :]
         shared = np.concatenate([*columns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
-        shared[:, : used.start] = 0.0
-        return Factors.of(np.stack([a, b], axis=1), measured, root, sigma.shape[1], shared)
+        # Of the place of the measured point, not of the camera.
+        measured[:, :, 3] += measured[:, :, :3] @ self.origin
+        lever = np.broadcast_to(self.origin, (count, 3))
+        return Factors.of(np.stack([a, b], axis=1), measured, root, 6 if self.drift else 3, shared, lever)
 
 
 @dataclass(frozen=True)

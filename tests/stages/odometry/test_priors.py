@@ -113,6 +113,40 @@ def test_a_sensor_joins_pieces_within_its_errors(sensor):
     assert 0.2 < nees(out, truth) < 3.0
 
 
+def wheels(body, mount, rng):
+    """Odometry on a plane of a body whose poses are true, as it would count its wheels."""
+    now, poses = RigidTransform.identity(), [mount.to_list()]
+    drift, turn = 1 + 0.02 * rng.standard_normal(), 0.005 * rng.standard_normal()
+    for a, b in pairwise(body):
+        step = a.inverse() @ b
+        way = np.linalg.norm(step.translation)
+        heading = np.arctan2(step.rotation[1, 0], step.rotation[0, 0]) + way * (turn + 0.005 * rng.standard_normal())
+        moved = (drift * step.translation + 0.02 * way * rng.standard_normal(3)) * [1.0, 1.0, 0.0]
+        now = now @ RigidTransform(rotation_exp([0.0, 0.0, heading]), moved)
+        poses.append((now @ mount).to_list())
+    stated = {"drift": 0.02, "turn": 0.005, "up": mount.rotation[2].tolist()}
+    return {**BASE, "odometry": {"poses": poses, **stated, "origin": mount.inverse().translation.tolist()}}
+
+
+@pytest.mark.parametrize("bumps", [0.0, 0.02, 0.05])
+@pytest.mark.parametrize("lost", [(), range(12, 19)])
+def test_wheels_on_rough_ground_are_believed_and_join_pieces(bumps, lost):
+    rng, place, body = np.random.default_rng(1), np.zeros(3), []
+    looks_ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]) @ rotation_exp([-0.2, 0.0, 0.0])
+    mount = RigidTransform(looks_ahead, np.array([0.3, 0.05, 1.2]))
+    for t in TIMES:
+        R = rotation_exp([0.0, 0.0, 0.6 * np.sin(2.5 * t)]) @ rotation_exp([*bumps * rng.standard_normal(2), 0.0])
+        body.append(RigidTransform(R, place))
+        place = place + (1 + 0.5 * np.sin(2.1 * t)) * R[:, 0]
+    truth = [T @ mount for T in body]
+    segments, before = run_of(truth, rng, lost=set(lost))
+    out = adjusted(segments, before, wheels(body, mount, rng))
+    assert out.meta["priors"]["odometry"]["used"]
+    assert out.meta["priors"]["odometry"]["left_out"] <= 1
+    assert [(piece[0], piece[-1]) for piece in out.meta["pieces"]] == [(0, 30)]
+    assert 0.1 < nees(out, truth) < 3.0
+
+
 def exact(truth, rng, late):
     return gnss(truth, rng, sigma=0.05, late=late)
 
