@@ -42,6 +42,9 @@ CALIBRATIONS = (
     *(".tsai", ".cameramodel", ".lbl", ".cahv", ".cahvor", ".cahvore"),
 )
 TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
+ODOMETRY, TRUTH = re.compile("odom|wheel|encoder", re.I), re.compile("truth|(?<![a-z])gt(?![a-z])", re.I)
+"""In the names of tables of dead reckoning, and of the truth."""
+
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
@@ -459,6 +462,13 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
+    # Of a robot on a plane, or by their name: dead reckoning is no truth.
+    wheels = ODOMETRY.search(path.stem) is not None and not TRUTH.search(path.stem)
+    places = [row[k] for name, k in meanings(table).items() if name in ("x", "y")]
+    if len(places) == 2 and (wheels or "yaw" in meanings(table)):
+        # Dead reckoning begins near 0, in a frame of its own.
+        geodetic = table.crs or of_photographs(table) or np.abs(places).max() > 1e4
+        return "positions" if geodetic else "odometry"
     if untimed(table) and len(table.rows) == pairs:
         return "truth"
     if matrix_at(table) is not None or (meanings(table).keys() >= {"x", "y", *QUATERNION} and not table.crs):

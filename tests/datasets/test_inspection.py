@@ -237,6 +237,9 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["#timestamp [ns],w_RS_S_x [rad s^-1],y,z,a,b,c", "140,0,0,0,9.8,0.1,-3.6"], "imu"),
         (["time,roll_deg,pitch_deg,yaw_deg", "0,1,2,3"], "attitude"),
         (["time,x,y", "0,1,2", "1,2,3"], "positions"),
+        (["time,x,y,yaw_deg", "0,1,2,0", "1,2,3,5"], "odometry"),
+        (["time,x,y,theta", "0,1,2,0", "1,2,3,0.1"], "odometry"),
+        (["time,easting,northing,yaw_deg", "0,431000,5411000,0", "1,431002,5411003,5"], "positions"),
         (["time,latitude,longitude,altitude", "0,48,9,2"], "positions"),
         (["time,lat,lon,alt,roll,pitch,yaw", "0,48,9,2,0.1,0.2,3"], "positions"),
         (["#Label,X/Longitude,Y/Latitude,Z/Altitude", *(f"0{k}.jpg,9,48,2" for k in range(4))], "positions"),
@@ -255,6 +258,15 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
 def test_tables_are_told_by_content(tmp_path, lines, kind):
     write_lines(tmp_path / "table.txt", lines)
     assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("wheel_odometry.tum", "odometry"), ("odom.csv", "odometry"), ("gt_odom.tum", "truth"), ("poses.tum", "truth")],
+)
+def test_dead_reckoning_is_no_truth(tmp_path, name, kind):
+    write_lines(tmp_path / name, ["# time x y z qx qy qz qw", *(f"{k} {k} 0 0 0 0 0.6 0.8" for k in range(3))])
+    assert table_kind(tmp_path / name, 2) == kind
 
 
 @pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
