@@ -345,14 +345,15 @@ def _camera(
 ) -> Iterator[Finding]:
     """Findings on the images of one camera."""
     at = [names[k] for k in looks]
-    blank = np.flatnonzero(_figure(looks, "deviation") < limits.uniform)
-    if blank.size:
+    uniform = _figure(looks, "deviation") < limits.uniform
+    if (blank := np.flatnonzero(uniform)).size:
         text = f"{blank.size} {camera} images show nothing, first frame {at[blank[0]]}"
         yield judge("images", text, {"blank": blank.size})
     for shade, name in (("black", "dark"), ("white", "bright")):
         share = float(np.median(_figure(looks, name)))
         yield judge("exposure", f"{100 * share:.0f} % of the {camera} images is {shade}", {"clipped": share})
-    change = np.nan_to_num(np.exp(np.abs(np.diff(np.log(np.maximum(_figure(looks, "mean"), 1.0))))))
+    shown = np.where(uniform, np.nan, np.maximum(_figure(looks, "mean"), 1.0))
+    change = np.nan_to_num(np.exp(np.abs(np.diff(np.log(shown)))))
     if change.size:
         k = int(np.argmax(change))
         text = f"{camera} brightness changes by a factor of {change[k]:.3g} from frame {at[k]} to {at[k + 1]}"

@@ -186,6 +186,12 @@ def test_bad_images_are_told(left, right, level, words):
     assert any(v.level == level and words in v.text for v in found)
 
 
+def test_an_image_that_shows_nothing_tells_of_no_exposure():
+    black = changed(mean=0.0, deviation=0.0)
+    found = input_checks.judge_looks(looks([GOOD, GOOD, black, GOOD, GOOD], [GOOD] * 5), NAMES, LIMITS)
+    assert [bad.code for bad in found if bad.level != "OK"] == ["RIL-650"]
+
+
 @pytest.mark.parametrize(("share", "level"), [(0.0, "OK"), (0.2, "WARN"), (0.97, "FAIL")])
 def test_sides(share, level):
     assert input_checks.judge_sides(share).level == level
