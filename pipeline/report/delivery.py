@@ -39,7 +39,7 @@ def account(scene: Scene, frames: Rows, pairs: Rows, unlike: Sequence[str] = ())
     """
     view = scene.view
     contradicted = [_item("contradiction", line, "") for line in (*contradictions(view), *unlike)]
-    missing = contradicted + _poses(frames) + _path(view) + _crosscheck_lost(scene)
+    missing = contradicted + _poses(view, frames) + _path(view) + _crosscheck_lost(scene)
     absent = _reference(view) + _local_paths(pairs) + _truth(view) + _crosscheck_off(view) + _vehicle(view)
     return {"delivered": _delivered(view, frames, pairs), "missing": missing, "absent": absent}
 
@@ -170,15 +170,17 @@ def _kind(label: str) -> str:
     return label.rpartition("/")[0] or label
 
 
-def _poses(frames: Rows) -> Items:
-    items = []
+def _poses(view: RunView, frames: Rows) -> Items:
+    items, remedy = [], ""
+    if view.sequence.odometry is not None and "odometry" not in view.sequence.priors:
+        remedy = ": state drift and turn_deg of [odometry], and it joins them"
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:
         items.append(_item("no pose", f"{len(lost)} of {len(frames)} frames have no pose", frame_words(lost)))
     apart = [r["frame"] for r in frames if r["posed"] and not r["in_world"]]
     if apart:
         what = f"{len(apart)} of {len(frames)} frames have a pose in another piece of the trajectory, not in the world"
-        items.append(_item("piece", what, frame_words(apart)))
+        items.append(_item("piece", what, frame_words(apart) + remedy))
     return items
 
 
