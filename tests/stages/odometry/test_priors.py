@@ -8,7 +8,7 @@ import test_adjust
 from test_adjust import errors, run_of
 
 from rille.stages.core.declare import NoParams
-from rille.stages.geometry.geometry import RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import RigidTransform, rotation_exp, rotation_log
 from rille.stages.geometry.pose_arrays import NO_VERTICAL
 from rille.stages.odometry.resection.adjust import adjust_stage
 from rille.stages.odometry.resection.sensors import OwnTrajectory, RelativePrior, departure, resampled
@@ -120,7 +120,7 @@ def wheels(body, mount, rng):
     for a, b in pairwise(body):
         step = a.inverse() @ b
         way = np.linalg.norm(step.translation)
-        heading = np.arctan2(step.rotation[1, 0], step.rotation[0, 0]) + way * (turn + 0.005 * rng.standard_normal())
+        heading = rotation_log(step.rotation)[2] + way * (turn + 0.005 * rng.standard_normal())
         moved = (drift * step.translation + 0.02 * way * rng.standard_normal(3)) * [1.0, 1.0, 0.0]
         now = now @ RigidTransform(rotation_exp([0.0, 0.0, heading]), moved)
         poses.append((now @ mount).to_list())
