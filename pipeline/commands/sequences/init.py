@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,7 @@ from rille.datasets.images.pairing import writable
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import hindrance
-from rille.datasets.text.names import derived_name
+from rille.datasets.text.names import derived_name, shell_word
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.core.errors import ConfigError
@@ -80,7 +79,8 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
-    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in findings.tables.items()]
+    tables = {**findings.tables, **({"masks": findings.masks.values()} if findings.masks else {})}
+    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in tables.items()]
     lines += [f"not read     {line}" for line in findings.unread]
     lines += [f"wrote        {path}"]
     lines += [f"needed       {line}" for line in needed]
@@ -89,6 +89,6 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
 
 def _next(path: Path, *, edit: bool = False) -> list[str]:
     """The next commands, for a shell."""
-    word = shlex.quote(str(path))
+    word = shell_word(path)
     steps = [*([f"edit {word}"] if edit else []), f"rille check {word}", f"rille reconstruct {word}"]
     return ["", "next:", *(f"  {step}" for step in steps)]
