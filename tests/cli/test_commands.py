@@ -129,7 +129,7 @@ def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None
 )
 def test_a_crate_away_from_its_images_says_which_and_where(
     tmp_path: Path, place: Place, of: str, words: str, command: str
-):
+) -> None:
     run = {"@id": "#run", "name": f"rille reconstruct {of}", "result": []}
     (tmp_path / "ro-crate-metadata.json").write_text(json.dumps({"@graph": [run]}))
     refused = place.here(command, tmp_path)
