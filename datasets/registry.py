@@ -102,6 +102,7 @@ def open_sequence(
     ConfigError
         An override is unknown, not permitted, or of another kind of sequence.
     """
+    _refuse_missing(name_or_path)  # before its parameters are judged
     sections = dict(overrides or {})
     preset = BUILT_IN.get(name_or_path, ("", {}))[1]
 
@@ -131,13 +132,8 @@ def _opened(name_or_path: str, digests: Digests) -> Sequence:
 def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if name_or_path in MANIFESTS:
         return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
+    _refuse_missing(name_or_path)
     path, number = _split(name_or_path)
-    if not is_there(name_or_path):
-        kind = "file" if path.suffix else "sequence"
-        known = [*BUILT_IN, *MANIFESTS]
-        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
-        remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
-        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # The user's manifest overrides the layout.
@@ -170,6 +166,22 @@ def is_there(name_or_path: str) -> bool:
     path = _split(name_or_path)[0]
     known = name_or_path in BUILT_IN or name_or_path in MANIFESTS
     return known or bool(name_or_path and (os.path.isfile(path) or os.path.isdir(path)))
+
+
+def _refuse_missing(name_or_path: str) -> None:
+    """Refuse a name that is none of a sequence, file or folder.
+
+    Raises
+    ------
+    InputError
+        Nothing has this name.
+    """
+    if not is_there(name_or_path):
+        path, known = _split(name_or_path)[0], [*BUILT_IN, *MANIFESTS]
+        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
+        remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
+        kind = "file" if path.suffix else "sequence"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
 
 
 def hindrance(place: Path) -> RilleError | None:
