@@ -46,8 +46,11 @@ TABLES = (".txt", ".csv", ".tum", ".dat", ".pos")
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
-COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|flow|label|conf|normal)", re.I)
-"""In the names of images that are no photographs, as beside those of simulators."""
+COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|valid|flow|label|conf|normal|dem(?![a-z]))", re.I)
+"""In the names of images and arrays that are no photographs, as beside those of simulators."""
+
+PROSE = re.compile(r"read.?me|licen[cs]e|copying|changes", re.I)
+"""At the beginning of the names of texts that are for people."""
 
 MASK = re.compile(r"(?<![a-z])masks?(?![a-z])(?!.*\.look$)", re.I)
 """In the names of masks of a camera; not in those of the pictures that `rille mask` writes beside them."""
@@ -142,7 +145,8 @@ def inspect(folder: Path) -> Findings:
     known = {*images, *texts}
     for path in (p for p in there if p in known):
         writable(there[path])
-    strange = [UNWRITABLE.sub("?", name) for path, name in there.items() if path not in known]
+    others = [name for path, name in there.items() if path not in known and not COMPUTED.search(name)]
+    strange = [UNWRITABLE.sub("?", name) for name in others]
     masks = _masks(folder, images)
     try:
         photographs = [path for path in images if there[path].replace(".look.", ".") not in masks.values()]
@@ -173,7 +177,8 @@ def inspect(folder: Path) -> Findings:
             found.tables.setdefault(kind, []).append(there[path])
             used.add(there[path])
     told = " ".join(found.unread)
-    unknown = [there[p] for p in texts if there[p] not in used and str(p) not in told]
+    unread_texts = (p for p in texts if there[p] not in used and not PROSE.match(p.name))
+    unknown = [there[p] for p in unread_texts if str(p) not in told]
     cameras = [name for name in unknown if _of_cameras(folder / name)]
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
@@ -309,7 +314,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
+    sets = [(pattern(of[0], folder), COMPUTED.search(at[1])) for at, of in both.items() if at != key]
+    others = [f"{of} and its right images: {'no photographs' if made else 'of another set'}" for of, made in sets]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [_relative(path, folder) for path in images if path not in paired]
     if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +11,11 @@ from rille.datasets.bags import is_bag
 from rille.datasets.images.pairing import writable
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
-from rille.datasets.registry import hindrance
+from rille.datasets.registry import folder_manifest, hindrance
 from rille.datasets.text.names import derived_name, shell_word
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, InputError
 
 
 def init(
@@ -36,7 +37,8 @@ def init(
     """
     hindered = hindrance(directory.absolute())  # absolute: not a built-in sequence of this name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
-        manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
+        bag = is_bag(directory)
+        manifest = "" if bag else f"{_left_out(directory)}; --output or --force writes a manifest nevertheless"
         print(f"{directory} opens as it is{manifest}")
         print("\n".join(_next(directory)))
         return
@@ -58,6 +60,14 @@ def init(
     elif hindered is not None:
         print(f"{directory} does not open as it is: {hindered.message}")
     print("\n".join(_report(findings, path, needed)))
+
+
+def _left_out(directory: Path) -> str:
+    """Masks of a folder that opens by its layout, which knows of none, in words; empty if there are none."""
+    with suppress(InputError):
+        masks = {} if folder_manifest(directory) else inspect(directory).masks
+        return f", without {' and '.join(masks.values())}" if masks else ""
+    return ""
 
 
 def _root(directory: Path, path: Path) -> str:

@@ -108,7 +108,7 @@ def test_masks_of_each_image_are_not_those_of_the_cameras(drive, capsys):
         for k in range(2):
             cv2.imwrite(str(drive / "mask" / side / f"{k}.png"), np.zeros((48, 64), np.uint8))
     init(drive)
-    assert "not read     mask/left/*.png and its right images: of another set" in capsys.readouterr().out
+    assert "not read     mask/left/*.png and its right images: no photographs" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("place", "root"), [(".", "drive"), ("drive/left", ".."), ("far/away", None)])
@@ -153,9 +153,12 @@ def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, 
     (drive / "calib.txt").write_text("\n".join(rows))
     init(drive)
     printed = capsys.readouterr().out
-    assert f"{drive} opens as it is" in printed
+    assert f"{drive} opens as it is; " in printed
     assert f"rille reconstruct {drive}\n" in printed
     assert not list(drive.glob("*.toml"))
+    cv2.imwrite(str(drive / "mask_right.png"), np.full((48, 64), 255, np.uint8))
+    init(drive)
+    assert f"{drive} opens as it is, without mask_right.png; " in capsys.readouterr().out
     init(drive, output=tmp_path / "m.toml")
     assert (tmp_path / "m.toml").is_file()
 
