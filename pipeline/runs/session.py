@@ -318,7 +318,8 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = late(opened.view, opened.drive, tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / LEDGER, total=total, holes=len(lacking(report["missing"])))
+    holes = len(lacking(report["missing"]))
+    events.add_facts(opened.folder / LEDGER, total=total, holes=holes, part=bool(opened.view.part))
     return report
 
 

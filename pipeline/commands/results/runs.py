@@ -42,7 +42,8 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             outdated = set(facts.get("outdated", ()))
             statuses = Counter(row["status"] for label, row in lookup.tasks(run).items() if label not in outdated)
             # "holes": how much the report lists as missing, as the closing line of the run says.
-            whole = f"{facts['holes']:d} missing" if facts.get("holes") else "complete"
+            whole = "a part" if facts.get("part") else "complete"
+            whole = f"{facts['holes']:d} missing" if facts.get("holes") else whole
             # "ok": all tasks have ended; "total": files and report are written too.
             failed = "unfinished" if facts.get("ok", True) else "failed"
             state = whole if "total" in facts else failed

@@ -28,7 +28,9 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "complete"]
     events.add_facts(run / lookup.LEDGER, holes=3)  # as the report counts, although no task has failed
     assert [line.split()[1:3] for line in runs.describe([run])][1] == ["3", "missing"]
-    events.add_facts(run / lookup.LEDGER, holes=0)
+    events.add_facts(run / lookup.LEDGER, holes=0, part=True)
+    assert [line.split()[1:3] for line in runs.describe([run])][1] == ["a", "part"]
+    events.add_facts(run / lookup.LEDGER, part=False)
     report = {"frames": [{"posed": True}, {"posed": False}], "metrics": {"trajectory_drift": {"value": 0.1234}}}
     (run / "report.json").write_text(json.dumps(report))
     assert [*runs.describe([run])][1].split()[-4:] == ["1.0", "1/2", "0.123", "%"]
