@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import glob
 import re
-import shlex
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
@@ -27,7 +26,9 @@ from rille.datasets.images.kinds import hints, line, split, unread
 from rille.datasets.images.pairing import UNWRITABLE, ImagePair, natural, of_one_camera, side_of, writable
 from rille.datasets.imu import names_sensors
 from rille.datasets.poses import of_images, of_poses, positions_of
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.columns import QUATERNION, matrix_at, meanings, of_photographs, untimed
+from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError, RilleError
@@ -48,8 +49,14 @@ ODOMETRY, TRUTH = re.compile("odom|wheel|encoder", re.I), re.compile("truth|(?<!
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
-COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|flow|label|conf|normal)", re.I)
-"""In the names of images that are no photographs, as beside those of simulators."""
+COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|valid|flow|label|conf|normal|dem(?![a-z]))", re.I)
+"""In the names of images and arrays that are no photographs, as beside those of simulators."""
+
+PROSE = re.compile(r"read.?me|licen[cs]e|copying|changes", re.I)
+"""At the beginning of the names of texts that are for people."""
+
+MASK = re.compile(r"(?<![a-z])masks?(?![a-z])(?!.*\.look$)", re.I)
+"""In the names of masks of a camera; not in those of the pictures that `rille mask` writes beside them."""
 
 CAMERA_WORDS = re.compile(
     r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl](_[xy])?\b", re.I
@@ -116,6 +123,7 @@ class Findings:
     views: FoundImages
     calibration: FoundCalibration | None = None
     others: list[str] = field(default_factory=list)
+    masks: dict[str, str] = field(default_factory=dict)
     tables: dict[str, list[str]] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
 
@@ -140,9 +148,12 @@ def inspect(folder: Path) -> Findings:
     known = {*images, *texts}
     for path in (p for p in there if p in known):
         writable(there[path])
-    strange = [UNWRITABLE.sub("?", name) for path, name in there.items() if path not in known]
+    others = [name for path, name in there.items() if path not in known and not COMPUTED.search(name)]
+    strange = [UNWRITABLE.sub("?", name) for name in others]
+    masks = _masks(folder, images)
     try:
-        found = Findings(folder, find_views(folder, images))
+        photographs = [path for path in images if there[path].replace(".look.", ".") not in masks.values()]
+        found = Findings(folder, find_views(folder, photographs), masks=masks)
     except InputError as error:
         text, lines = "; ".join([error.message, *search.closed[:1]]), unread(strange)
         if any(map(hints, strange)) and not images:
@@ -169,18 +180,29 @@ def inspect(folder: Path) -> Findings:
             found.tables.setdefault(kind, []).append(there[path])
             used.add(there[path])
     told = " ".join(found.unread)
-    unknown = [there[p] for p in texts if there[p] not in used and str(p) not in told]
+    unread_texts = (p for p in texts if there[p] not in used and not PROSE.match(p.name))
+    unknown = [there[p] for p in unread_texts if str(p) not in told]
     cameras = [name for name in unknown if _of_cameras(folder / name)]
     found.unread += [line("calibration", cameras, KNOWN)] if cameras else []
     found.unread += unread([name for name in unknown if name not in cameras] + strange)
     return found
 
 
+def _masks(folder: Path, images: list[Path]) -> dict[str, str]:
+    """The one mask of each camera, by side; empty where there are several, as one of each image, or nothing else."""
+    of_side: dict[str, list[str]] = defaultdict(list)
+    for name in (_relative(path, folder) for path in images):
+        if MASK.search(name.rpartition(".")[0]) and (at := side_of(name.rpartition(".")[0])) is not None:
+            of_side[CAMERAS[at[1]]].append(name)
+    one = all(len(names) == 1 for names in of_side.values()) and len(of_side) < len(images)
+    return {side: names[0] for side, names in of_side.items()} if one else {}
+
+
 def _places_in_images(left: str, folder: Path, search: Search) -> list[str]:
     """A line on places in EXIF of left images, and how they become a table; empty if there are none."""
     sample = search.matching(folder, left)[:MOST_TEXTS]
     places = sum(map(located, sample))
-    export = f"exiftool -csv -n -GPSLatitude -GPSLongitude -GPSAltitude {shlex.quote(str(Path(left).parent))} > gps.csv"
+    export = f"exiftool -csv -n -GPSLatitude -GPSLongitude -GPSAltitude {shell_word(Path(left).parent)} > gps.csv"
     text = f"places in EXIF of {places} of {count(len(sample), 'left image')}: `{export}`, and [positions] of that file"
     return [text] if places else []
 
@@ -295,7 +317,8 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
+    sets = [(pattern(of[0], folder), COMPUTED.search(at[1])) for at, of in both.items() if at != key]
+    others = [f"{of} and its right images: {'no photographs' if made else 'of another set'}" for of, made in sets]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [_relative(path, folder) for path in images if path not in paired]
     if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):

@@ -10,7 +10,6 @@ folder, or as ``ROOT:NN``), and a self-contained folder with two image folders, 
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Trut
 from rille.datasets.manifest.opening import open_described
 from rille.datasets.manifest.rig import CAR, STREET
 from rille.datasets.protocol import Sequence
-from rille.datasets.text.names import derived_name
+from rille.datasets.text.names import derived_name, shell_word
 from rille.datasets.text.reading import read_text
 from rille.stages.core.errors import InputError
 
@@ -60,7 +59,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     folder = folder.resolve()
     if not (folder / "calib.txt").is_file():
         text = f"{path} has image folders {' and '.join(sides)}, but no calib.txt"
-        remedy = f"`rille init {shlex.quote(str(path))}` writes a manifest that says what is needed"
+        remedy = f"`rille init {shell_word(path)}` writes a manifest that says what is needed"
         raise InputError("RIL-278", text, remedy=remedy)
     sequence = open_described(manifest_of(folder, sides), folder, str(folder), digests)
     return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})

@@ -135,7 +135,7 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
     if format == "kitti" or (format == "auto" and shaped and not by_name.have_rotation(meant)):
         return _of_matrices(table, 1.0 if unit is None else unit, timed=first == 1)
     columns = _columns(table, format, meant)
-    warnings, quaternion = _of_degrees(table), columns.keys() >= set(QUATERNION)
+    warnings, quaternion = tuple[str, ...](), columns.keys() >= set(QUATERNION)
     if "time" in columns:
         lost = np.zeros(len(table.rows), bool)
         if quaternion:
@@ -242,7 +242,7 @@ def positions_of(
     placed = [meant["x"], meant["y"]]
     placed += [meant["z"]] if "z" in meant and not np.isnan(table.values([meant["z"]])).all() else []
     timed = [meant["time"]] if "time" in meant else []
-    named, warnings = not timed and bool(np.isinf(table.values([0])).all()), _of_degrees(table)
+    named, warnings = not timed and bool(np.isinf(table.values([0])).all()), tuple[str, ...]()
     if timed or named:  # else rows are pairs
         table, left_out = table.measured([*timed, *placed], _without_fix(table, *placed[:2]))
         warnings += left_out
@@ -264,12 +264,6 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
         return ()
     line = f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0"
     return (warning("RIL-709", f"{line}: write them in double precision, or less a constant"),)
-
-
-def _of_degrees(table: TextTable) -> tuple[str, ...]:
-    """Warning about coordinates that are :func:`projected`."""
-    text = f"{table.name}: places on Earth are projected to {table.crs}"
-    return (warning("RIL-774", text),) if table.crs else ()
 
 
 def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pkgutil
-import shlex
 import site
 import sysconfig
 from collections.abc import Mapping
@@ -27,6 +26,7 @@ from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
 from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
+from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import Search, missing_target
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean
@@ -102,6 +102,7 @@ def open_sequence(
     ConfigError
         An override is unknown, not permitted, or of another kind of sequence.
     """
+    _refuse_missing(name_or_path)  # before its parameters are judged
     sections = dict(overrides or {})
     preset = BUILT_IN.get(name_or_path, ("", {}))[1]
 
@@ -131,14 +132,8 @@ def _opened(name_or_path: str, digests: Digests) -> Sequence:
 def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     if name_or_path in MANIFESTS:
         return open_manifest(Path(__file__).parent / "manifests" / f"{name_or_path}.toml", digests)
+    _refuse_missing(name_or_path)
     path, number = _split(name_or_path)
-    # os.path, because pathlib raises for impossible names.
-    if not (os.path.isfile(path) or os.path.isdir(path)) or not name_or_path:
-        kind = "file" if path.suffix else "sequence"
-        known = [*BUILT_IN, *MANIFESTS]
-        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
-        remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
-        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
     if path.is_file() and path.suffix.lower() == ".toml":
         return open_manifest(path, digests)
     # The user's manifest overrides the layout.
@@ -154,7 +149,7 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
         remedy = "; ".join([*hints(name_or_path), remedy])
         raise InputError("RIL-992", f"the file {name_or_path} is no sequence", remedy=remedy)
     beside = Path(f"{path}.rille.toml")
-    remedy = f"{of_one_camera(path)}`rille init {shlex.quote(name_or_path)}` writes a manifest; "
+    remedy = f"{of_one_camera(path)}`rille init {shell_word(name_or_path)}` writes a manifest; "
     remedy += "`rille datasets list` names what opens without one"
     if beside.is_file():
         remedy = f"give its manifest, {beside}"
@@ -163,6 +158,30 @@ def _of_files(name_or_path: str, digests: Digests) -> Sequence:
     elif (path / "report.json").is_file():
         remedy = "it is a run, not a sequence: `rille view` shows it, and rille.open_run reads it"
     raise InputError("RIL-277", f"{name_or_path} has no layout that is recognised", remedy=remedy)
+
+
+def is_there(name_or_path: str) -> bool:
+    """Whether a sequence has this name, or a file or a folder has it."""
+    # os.path, because pathlib raises for impossible names.
+    path = _split(name_or_path)[0]
+    known = name_or_path in BUILT_IN or name_or_path in MANIFESTS
+    return known or bool(name_or_path and (os.path.isfile(path) or os.path.isdir(path)))
+
+
+def _refuse_missing(name_or_path: str) -> None:
+    """Refuse a name that is none of a sequence, file or folder.
+
+    Raises
+    ------
+    InputError
+        Nothing has this name.
+    """
+    if not is_there(name_or_path):
+        path, known = _split(name_or_path)[0], [*BUILT_IN, *MANIFESTS]
+        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
+        remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
+        kind = "file" if path.suffix else "sequence"
+        raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)
 
 
 def hindrance(place: Path) -> RilleError | None:

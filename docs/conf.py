@@ -31,11 +31,14 @@ extensions = [
 ]
 exclude_patterns = ["_build", "gallery", "examples/*.ipynb", "**/sg_execution_times.rst", "sg_execution_times.rst"]
 
+highlight_language = "none"  # blocks without a language are what a program prints
+
 html_theme = "pydata_sphinx_theme"
 html_title = "Rille"
 html_static_path = ["_static"]
 html_css_files = ["rille.css"]
 html_show_sourcelink = False
+html_sidebars = {"when-something-goes-wrong": []}  # its section has no other page
 html_theme_options = {
     "navbar_align": "left",
     "header_links_before_dropdown": 7,

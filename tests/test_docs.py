@@ -68,7 +68,7 @@ def not_run() -> str:
 def test_the_dataflow_is_drawn_once() -> None:
     from rille.pipeline.flow import reconstruction
 
-    drawn = re.search(r"^```\n(image ->.*?)^```", (DOCS / "dataflow.md").read_text(encoding="utf-8"), re.M | re.S)
+    drawn = re.search(r"^```text\n(image ->.*?)^```", (DOCS / "dataflow.md").read_text(encoding="utf-8"), re.M | re.S)
     assert drawn is not None
     assert textwrap.indent(drawn[1], "    ") in str(reconstruction.__doc__)
 

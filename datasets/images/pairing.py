@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -17,6 +16,7 @@ import numpy as np
 
 from rille.datasets.images import files
 from rille.datasets.images.headers import Headers
+from rille.datasets.text.names import shell_word
 from rille.datasets.text.times import seconds, undated
 from rille.stages.core.errors import IncompleteError, InputError, warning
 from rille.stages.core.quantities import count
@@ -267,7 +267,7 @@ def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
 
 def of_one_camera(folder: Path) -> str:
     """Remedy for a folder that is named as the images of one camera; empty for any other."""
-    both = shlex.quote(str(folder.parent if folder.name else folder.resolve().parent))
+    both = shell_word(folder.parent if folder.name else folder.resolve().parent)
     one = f"if {folder} holds the images of one camera, give the folder of both: `rille init {both}`; else "
     return one if side_of(folder.resolve().name) is not None else ""
 

@@ -196,10 +196,17 @@ class MotionReader:
         remaining, whole = iter(rows), sum(not pair.absent for pair in self.pairs)
         return [None if pair.absent else next(remaining) for pair in self.pairs] if len(rows) == whole else None
 
+    def table(self, file: str, format: str = "auto") -> TextTable:
+        """The table of a file of poses or positions, with a warning where nobody has stated its projection."""
+        read = read_motion(self.root / file, format, self.crs)
+        if read.crs and not self.crs:
+            self.warn((warning("RIL-774", f"{read.name}: places on Earth are projected to {read.crs}"),))
+        return read
+
     def poses(self, section: model.PoseFile | model.Attitude, table: str, read: TextTable | None = None) -> Poses:
         """T_reference_left of each pair from a file of a body's poses, which may have been ``read`` before."""
         path = self.root / section.file
-        rows = read or read_motion(path, section.format, self.crs)
+        rows = read or self.table(section.file, section.format)
         timed = poses_of(rows, section.format, section.unit if isinstance(section, model.PoseFile) else 1.0)
         self.warn(timed.warnings)
         poses: Poses = timed.poses
@@ -268,7 +275,7 @@ class MotionReader:
 
     def truth(self, section: model.Truth) -> None:
         """Read true poses of each pair, or true positions with their own times."""
-        rows = read_motion(self.root / section.file, section.format, self.crs)
+        rows = self.table(section.file, section.format)
         alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
@@ -365,7 +372,7 @@ class MotionReader:
             The file holds no positions, or has neither times nor one row for each pair, or no time in common with the
             pairs.
         """
-        table = read_motion(self.root / section.file, crs=self.crs)
+        table = self.table(section.file)
         found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"

@@ -1,10 +1,12 @@
-"""Names of sequences, which become folders, file names and keys of the cache."""
+"""Names of sequences, which become folders, file names and keys of the cache; paths as words of a command."""
 
 from __future__ import annotations
 
 import re
+import shlex
 import unicodedata
 import zlib
+from pathlib import Path
 
 from rille.stages.core.errors import InputError
 
@@ -44,3 +46,8 @@ def derived_name(text: str) -> str:
     mark = f"_{zlib.crc32(text.encode(errors='surrogatepass')):08x}" if lost else ""
     name = OTHER.sub("_", plain).strip("_.-")[: MAX_CHARACTERS - len(mark)].rstrip("_.-")
     return f"{name if name and name not in RESERVED else 'sequence'}{mark}"
+
+
+def shell_word(path: str | Path) -> str:
+    """A path as a word of a command, for a shell: quoted, and no option."""
+    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))

@@ -19,6 +19,6 @@ const drawProfile = (c, D, metres, round) => {
   const far = s[s.length - 1], tick = round(far / 5);
   for (let d = 0; d <= far; d += tick) { const x = 44 + (w - 88) * d / far; p.beginPath(); p.moveTo(x, 10); p.lineTo(x, foot); p.stroke(); }
   p.font = "11px system-ui, sans-serif"; p.fillStyle = ink;
-  p.fillText(metres(high), 0, 20); p.fillText(metres(low), 0, low_); p.fillText(D.limit + "°", w - 40, Y(D.limit) + 4); p.fillText("0°", w - 40, foot);
-  p.fillText(`height (blue) and inclination (orange; dashed: limit) along the path of ${metres(far)}, lines every ${tick < 1 ? 100 * tick + " cm" : tick + " m"}`, 44, h - 4);
+  p.fillText(metres(high), 0, 20, 42); p.fillText(metres(low), 0, low_, 42); /* at most so wide */ p.fillText(D.limit + "°", w - 40, Y(D.limit) + 4); p.fillText("0°", w - 40, foot);
+  p.fillText(`height (blue) and inclination (orange; dashed: limit) along the path of ${metres(far)}, lines every ${tick < 1 ? 100 * tick + " cm" : tick + " m"}`, 0, h - 4, w);
 };

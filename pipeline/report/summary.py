@@ -141,7 +141,8 @@ def given_numbers(view: RunView) -> list[str]:
     ahead = float((steps[:, 2] ** 2 / np.maximum(long, 1e-12)).sum())
     left, off = rig.left, float(np.linalg.norm(poses[-1, :, 3] - poses[0, :, 3]))
     line = (
-        "Scale and heading rest on the calibration as given, whose errors a straight drive does not show. 1 % of the "
+        "By the images alone, scale and heading rest on the calibration as given, whose errors a straight drive does "
+        "not show. 1 % of the "
         f"baseline ({metres(rig.baseline)}) is {metres(0.01 * long.sum())} of the path of {metres(long.sum())}; 1 % of "
         f"the focal length ({left.fx:.4g} px) is {metres(0.01 * ahead)}; a principal point off by 1 % of the image's "
         f"width ({0.01 * left.width:.2g} px) leads its end {metres(0.01 * left.width / left.fx * off)} aside"

@@ -214,12 +214,13 @@ def judge_times(of: Sequence, frames: Frames) -> Finding:
         return judge("times", "none: frames count as equally spaced" if of.times is None else "one frame")
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
-        return judge("times", f"time goes back or rests from frame {k} to {k + 1}", {"steps back": 1})
+        return judge("times", f"time goes back or rests from frame {frames[k]} to {frames[k + 1]}", {"steps back": 1})
     usual = float(np.median(steps))
     gaps, longest = int((steps > 2.5 * usual).sum()), int(np.argmax(steps))
     words = f"{1 / usual:.3g} frames a second over {float(steps.sum()):.4g} s"
     if gaps:
-        words += f"; {count(gaps, 'gap')}, the longest {steps[longest]:.3g} s from frame {longest} to {longest + 1}"
+        where = f"from frame {frames[longest]} to {frames[longest + 1]}"
+        words += f"; {count(gaps, 'gap')}, the longest {steps[longest]:.3g} s {where}"
     return judge("times", words, {"gaps": gaps})
 
 

@@ -53,7 +53,8 @@ def reading(*runs: Path) -> Iterator[None]:
 
 
 def find(text: str, runs: Path) -> Path:
-    """Folder of a run: a path, ``SEQUENCE`` (its latest), ``SEQUENCE/ID``, ``ID``, or ``latest`` of all.
+    """Folder of a run: its path, or that of a sequence's runs; ``SEQUENCE`` (its latest), ``SEQUENCE/ID``, ``ID``, or
+    ``latest`` of all.
 
     Raises
     ------
@@ -64,7 +65,7 @@ def find(text: str, runs: Path) -> Path:
     if text == "latest" and known:
         return max(known, key=lambda run: run.name).resolve()
     # Paths before names: in another folder of runs a user means the runs there.
-    for path in (Path(text), runs / text, runs / text / "latest"):
+    for path in (Path(text), Path(text, "latest"), runs / text, runs / text / "latest"):
         if (path / LEDGER).is_file():
             return path.resolve()
     # By its name alone, or the last one of a sequence none of whose runs has ended.

@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
-from rille.datasets.registry import open_sequence
+from rille.datasets.registry import is_there, open_sequence
+from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
@@ -41,7 +42,7 @@ from rille.pipeline.runs import part_of_run, roots, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
-from rille.stages.core.errors import ConfigError, RilleError, warning, within
+from rille.stages.core.errors import ConfigError, InputError, RilleError, warning, within
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -73,10 +74,21 @@ Chosen = TypeVar("Chosen", bound=Settings)
 
 
 def resolved(sequence: str, options: Chosen) -> tuple[str, Chosen, rocrate.Crate | None]:
-    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew."""
+    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew.
+
+    Raises
+    ------
+    InputError
+        The crate's sequence is not where its command says.
+    """
     crate = rocrate.read(Path(sequence))
     if crate is None:
         return sequence, options, None
+    if not is_there(crate.sequence):
+        text = f"{sequence} is a run of {crate.sequence}, which is not here, and a crate holds no images"
+        whence = f"name the crate {shell_word(crate.folder.resolve())} in a folder where it lies"
+        whence = "bring it, or a link to it, to this path" if Path(crate.sequence).is_absolute() else whence
+        raise InputError("RIL-612", text, remedy=f"{whence}; {rocrate.METADATA} has the SHA-256 of each image")
     own: dict[str, Any] = {"config": crate.folder / "config.toml", "frames": crate.options.get("--frames", (None,))[-1]}
     own |= {name: crate.options.get(f"--{name}", ()) for name in ("until", "only") if hasattr(options, name)}
     return crate.sequence, replace(options, **{n: getattr(options, n) or value for n, value in own.items()}), crate
@@ -306,7 +318,8 @@ def _write(opened: _Opened, result: driver.Result, made: run_files.Made) -> dict
     whole = late(opened.view, opened.drive, tasks=tasks, seconds=result.seconds, left_out=result.left_out)
     report = run_files.write(opened.folder, whole, made, opened.store)
     total = (datetime.now(UTC) - opened.started).total_seconds()
-    events.add_facts(opened.folder / LEDGER, total=total, holes=bool(lacking(report["missing"])))
+    holes = len(lacking(report["missing"]))
+    events.add_facts(opened.folder / LEDGER, total=total, holes=holes, part=bool(opened.view.part))
     return report
 
 

@@ -108,11 +108,34 @@ def leads_away(poses: Floats) -> bool:
     return bool(np.linalg.norm(steps.sum(axis=0)) > 2.0 * np.linalg.norm(steps))
 
 
-def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:
+def expected(covariance: Floats, piece: NDArray[np.integer[Any]]) -> dict[str, float]:
+    """Disagreements of two trajectories whose errors both are as large as stated for ours, by the names of their
+    arrays.
+
+    Of a frame it is that of the RMS standard deviation; of a motion, that of the mean growth of the variance from frame
+    to frame.
+
+    Parameters
+    ----------
+    covariance : (frame, 6, 6) of (position m, rotation rad), grown from the first frame of its piece; NaN without one.
+    piece : (frame,) piece of our trajectory, -1 without a pose.
+    """
+    out, joined = dict[str, float](), np.diff(piece) == 0
+    for name, part in (("distance", slice(3)), ("angle", slice(3, 6))):
+        variance = np.trace(covariance[:, part, part], axis1=1, axis2=2)
+        for key, values in ((name, variance), (f"step_{name}", np.diff(variance)[joined])):
+            known = values[np.isfinite(values)]
+            # 2.0: the two errors are independent; those of the calibration, which both share, are not among them.
+            out[key] = math.sqrt(2.0 * max(float(known.mean()), 0.0)) if known.size else 0.0
+    return out
+
+
+def flag(arrays: Mapping[str, Floats], sigmas: Mapping[str, float]) -> tuple[Bytes, dict[str, float | None]]:
     """Bits of :data:`REASONS` for each frame that stands out, and the limit of each disagreement (None: no values).
 
-    The limit is the median plus :data:`MIN_SIGMAS` robust standard deviations, at least :data:`MIN_RATIO` medians, and
-    at least the value from which on the reason counts.
+    The limit is the median plus :data:`MIN_SIGMAS` robust standard deviations, at least :data:`MIN_RATIO` medians, at
+    least the value from which on the reason counts, and at least :data:`MIN_SIGMAS` of the :func:`expected` ones: of a
+    few frames that happen to agree well, the median says little.
     """
     flags = np.zeros(len(arrays["distance"]), np.uint8)
     limits: dict[str, float | None] = dict.fromkeys(REASONS)
@@ -120,7 +143,8 @@ def flag(arrays: Mapping[str, Floats]) -> tuple[Bytes, dict[str, float | None]]:
         values = arrays[name][np.isfinite(arrays[name])]
         if values.size:
             median = float(np.median(values))
-            limit = max(median + MIN_SIGMAS * mad_sigma(values), MIN_RATIO * median, reason.least)
+            least = max(reason.least, MIN_SIGMAS * sigmas.get(name, 0.0))
+            limit = max(median + MIN_SIGMAS * mad_sigma(values), MIN_RATIO * median, least)
             flags[arrays[name] > limit] |= np.uint8(reason.bit)
             limits[name] = limit
     return flags, limits
@@ -147,7 +171,7 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 @stage(
     "agreement",
-    version=4,
+    version=5,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
         Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),
@@ -170,7 +194,9 @@ def agreement_stage(
     piece = unbroken(np.nan_to_num(numbers, nan=-1).astype(np.int64), own)
     arrays, scale, scaled = compare(ours, theirs, piece)
     arrays["line_distance"] = lines
-    flags, limits = flag(arrays)
+    # Without errors of the calibration, which both share.
+    stated = np.asarray(trajectory.arrays.get("own_covariance", np.zeros((len(frames), 6, 6))), np.float64)
+    flags, limits = flag(arrays, expected(stated, own))
     compared = np.isfinite(arrays["distance"])
     # Each of our pieces has its own frame of reference: no path leads from one to the next.
     there = np.diff(own[compared]) == 0
@@ -200,7 +226,8 @@ def agreement_stage(
         "rule": f"disagreement above the median by more than {MIN_SIGMAS:g} robust standard deviations "
         f"(1.4826 MAD), and above {MIN_RATIO:g} medians; in position, rotation (from "
         f"{math.degrees(REASONS['angle'].least):g}° on), or the "
-        "motion since the frame before; or matches of left and right as far "
+        f"motion since the frame before, in all of them by more than {MIN_SIGMAS:g} standard deviations as stated; "
+        "or matches of left and right as far "
         f"(from {REASONS['line_distance'].least:g} px on) from their epipolar lines",
         "limits": {n: v if v is None or "angle" not in n else math.degrees(v) for n, v in limits.items()},
         "flagged": [

@@ -125,6 +125,22 @@ def test_a_crate_is_run_again_and_compared(place: Place, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("command", ["reconstruct", "plan", "graph", "check"])
 @pytest.mark.parametrize(
+    ("of", "words"), [("rover.toml", "in a folder where"), ("/no/such/rover.toml", "to this path")]
+)
+def test_a_crate_away_from_its_images_says_which_and_where(
+    tmp_path: Path, place: Place, of: str, words: str, command: str
+) -> None:
+    run = {"@id": "#run", "name": f"rille reconstruct {of}", "result": []}
+    (tmp_path / "ro-crate-metadata.json").write_text(json.dumps({"@graph": [run]}))
+    refused = place.here(command, tmp_path)
+    assert refused.status == 2
+    assert "RIL-612" in refused.complaint
+    assert f"a run of {of}, which is not here" in refused.complaint
+    assert words in refused.complaint
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "plan", "graph", "check"])
+@pytest.mark.parametrize(
     "content", ["{", '{"@graph": []}', '{"@graph": [{"@id": "#run", "name": "rm -r x", "result": []}]}']
 )
 def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, content: str, command: str) -> None:

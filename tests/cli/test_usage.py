@@ -105,7 +105,7 @@ WRONG = {
         ("other", "RIL-001"),
         ("other --to obj", "RIL-001"),
         ("no-such-run --to laz", "RIL-067"),
-        ("runs/other --to colmap", "RIL-067"),
+        ("runs/other/none --to colmap", "RIL-067"),
         ("runs/other/latest --to laz -o cloud.ply", "RIL-871"),
         ("other --to glb --every 4", "RIL-967"),
         ("other --to frames --voxel 0.1", "RIL-967"),

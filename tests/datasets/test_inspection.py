@@ -640,9 +640,10 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
         "more.pdf",
         "drive.bag",
         "s.npz",
+        "disparity.npz",
     ):
         (tmp_path / name).write_bytes(b"")
-    write_lines(tmp_path / "readme.txt", ["what this is"])
+    write_lines(tmp_path / "readme.txt", ["what this is, its calibration and its baseline"])
     write_lines(tmp_path / "gps.txt", ["$GPGGA,120000.00,4751.2,N,01500.0,E,4,12,0.6,500.2,M,46.9,M,1.0,0000*41"])
     (tmp_path / "rig.yaml").write_text("camera_matrix: [1, 2\n")
     found = inspect(tmp_path)
@@ -661,7 +662,7 @@ def test_what_is_not_read_is_listed_by_kind_with_the_next_step(tmp_path):
     assert "1 headerless image (r.raw): " in text
     assert "1 planetary image (nav.IMG): convert them" in text
     assert "gps.txt is NMEA, no table" in text
-    assert "3 files (readme.txt and 2 more): neither images nor" in text
+    assert "2 files (more.pdf and 1 more): neither images nor" in text
     assert "rig.yaml cannot be parsed" in text
     assert len(found.unread) == 12
     assert all(f"# Not read: {line}" in manifest_text(found, ".") for line in found.unread)

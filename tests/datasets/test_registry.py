@@ -73,8 +73,9 @@ def test_bad_overrides_say_what_is_permitted(values, expected):
 
 @pytest.mark.parametrize("name", ["mokup", "mockup_short", "Mockup"])
 def test_near_misses_are_suggested(name):
-    with raises("RIL-276", "mean mockup"):
-        open_sequence(name)
+    for overrides in ({}, {"mockup": {"seed": 1}}):
+        with raises("RIL-276", "mean mockup"):
+            open_sequence(name, overrides)
 
 
 def test_an_unknown_folder_or_file_says_how_to_open_it(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import sys
 import time
@@ -13,6 +12,7 @@ from typing import NamedTuple
 from rille.datasets.images.arrivals import SETTLE_SECONDS, Arrivals
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.registry import open_sequence
+from rille.datasets.text.names import shell_word
 from rille.pipeline.commands.complaints import complain
 from rille.pipeline.engine.plain import warned
 from rille.pipeline.engine.workers import Workers
@@ -48,7 +48,7 @@ def watch(seq: str, *, options: WatchOptions = WatchOptions()) -> int:
         return watched.to_the_end()
     except KeyboardInterrupt:
         last = f"the last result is {watched.folder}" if watched.folder else "there is no result yet"
-        print(f"rille: interrupted; {last}; `rille reconstruct {shlex.quote(seq)}` computes the rest", file=sys.stderr)
+        print(f"rille: interrupted; {last}; `rille reconstruct {shell_word(seq)}` computes the rest", file=sys.stderr)
         return INTERRUPTED
     finally:
         for workers in kept:

@@ -18,6 +18,8 @@ from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.quantities import metres, quantity
 
+BEGINS = "another result of equal inputs"
+
 
 def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> None:
     """Compare two runs: which parameters, tasks, figures and positions differ.
@@ -51,7 +53,7 @@ def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
 def _tasks(a: Path, b: Path) -> Iterator[str]:
     """Counts by stage: tasks with another result, and tasks with a result in one run alone, or in neither.
 
-    Tasks that differ though their inputs do not are where the difference begins: files, parameters or code.
+    Tasks that differ though their inputs do not are where the difference begins; `rille why` says of one by what.
     """
     ledgers = [lookup.tasks(run) for run in (a, b)]
     # A failed or skipped task has no digest.
@@ -62,10 +64,12 @@ def _tasks(a: Path, b: Path) -> Iterator[str]:
         read, also = (rows[label].get("inputs", {}) for rows in ledgers)
         names = chain.from_iterable(np.ravel(one) for one in read.values())
         if read == also and all(len({*digests.get(name, ())}) < 2 for name in names):
-            fates[label] = "another result of equal inputs"
+            fates[label] = BEGINS
     yield f"tasks         {total['the same result']} with the same result, {total['another result']} with another"
     stages = Counter((fate, (ledgers[1] | ledgers[0])[label]["stage"]) for label, fate in fates.items())
     yield from (f"  {stage}: {n} {fate}" for (fate, stage), n in stages.items() if fate != "the same result")
+    if first := next((label for label, fate in fates.items() if fate == BEGINS), ""):
+        yield f"  by the manifest, parameters, files or code: rille why {lookup.name(b)} {first}"
 
 
 def _fate(a: str | None, b: str | None) -> str:

@@ -41,10 +41,12 @@ def describe(chosen: Iterable[Path]) -> Iterator[str]:
             facts = events.facts(run / lookup.LEDGER)
             outdated = set(facts.get("outdated", ()))
             statuses = Counter(row["status"] for label, row in lookup.tasks(run).items() if label not in outdated)
-            missing = statuses["failed"] + statuses["skipped"]
+            # "holes": how much the report lists as missing, as the closing line of the run says.
+            whole = "a part" if facts.get("part") else "complete"
+            whole = f"{facts['holes']:d} missing" if facts.get("holes") else whole
             # "ok": all tasks have ended; "total": files and report are written too.
-            whole = "unfinished" if "total" not in facts else "with holes" if facts.get("holes") else "complete"
-            state = "unfinished" if "ok" not in facts else f"{missing} missing" if missing else whole
+            failed = "unfinished" if facts.get("ok", True) else "failed"
+            state = whole if "total" in facts else failed
             counts = f"{statuses['computed']:8d} {statuses['cached']:8d}"
             seconds = facts.get("total", facts.get("seconds"))
             took = "" if seconds is None else f"{seconds:.1f}"

@@ -106,7 +106,7 @@ def _computed_by(row: Mapping[str, Any], run: Path) -> str:
         for other in lookup.tasks(before).values():
             if other.get("key") == row.get("key") and other["status"] == "computed":
                 return f"; run {lookup.name(before)} computed it"
-    return "; the run that computed it is not kept"
+    return f"; no run that is kept in {run.parent.parent} computed it"
 
 
 def _inputs(row: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> Iterable[str]:

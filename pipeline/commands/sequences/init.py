@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +11,11 @@ from rille.datasets.bags import is_bag
 from rille.datasets.images.pairing import writable
 from rille.datasets.inspection import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
-from rille.datasets.registry import hindrance
-from rille.datasets.text.names import derived_name
+from rille.datasets.registry import folder_manifest, hindrance
+from rille.datasets.text.names import derived_name, shell_word
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
-from rille.stages.core.errors import ConfigError
+from rille.stages.core.errors import ConfigError, InputError
 
 
 def init(
@@ -37,7 +37,8 @@ def init(
     """
     hindered = hindrance(directory.absolute())  # absolute: not a built-in sequence of this name
     if output is None and not force and (directory.is_dir() or is_bag(directory)) and hindered is None:
-        manifest = "" if is_bag(directory) else "; --output or --force writes a manifest nevertheless"
+        bag = is_bag(directory)
+        manifest = "" if bag else f"{_left_out(directory)}; --output or --force writes a manifest nevertheless"
         print(f"{directory} opens as it is{manifest}")
         print("\n".join(_next(directory)))
         return
@@ -61,6 +62,14 @@ def init(
     print("\n".join(_report(findings, path, needed)))
 
 
+def _left_out(directory: Path) -> str:
+    """Masks of a folder that opens by its layout, which knows of none, in words; empty if there are none."""
+    with suppress(InputError):
+        masks = {} if folder_manifest(directory) else inspect(directory).masks
+        return f", without {' and '.join(masks.values())}" if masks else ""
+    return ""
+
+
 def _root(directory: Path, path: Path) -> str:
     """The folder as seen from the manifest: relative if the manifest lies in or beside it."""
     relative = os.path.relpath(directory.resolve(), path.resolve().parent)
@@ -80,7 +89,8 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
-    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in findings.tables.items()]
+    tables = {**findings.tables, **({"masks": findings.masks.values()} if findings.masks else {})}
+    lines += [f"{kind:12s} {', '.join(files)}" for kind, files in tables.items()]
     lines += [f"not read     {line}" for line in findings.unread]
     lines += [f"wrote        {path}"]
     lines += [f"needed       {line}" for line in needed]
@@ -89,6 +99,6 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
 
 def _next(path: Path, *, edit: bool = False) -> list[str]:
     """The next commands, for a shell."""
-    word = shlex.quote(str(path))
+    word = shell_word(path)
     steps = [*([f"edit {word}"] if edit else []), f"rille check {word}", f"rille reconstruct {word}"]
     return ["", "next:", *(f"  {step}" for step in steps)]

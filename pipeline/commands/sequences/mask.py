@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.names import shell_word
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import Output, check_new
 from rille.pipeline.steps import open as open_sequence
@@ -55,6 +55,6 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> None:
         print(f"{camera:12s} {100 * body.mean():.1f} % keeps its place in {len(images)} images: {path}")
         written.append(f'{camera} = "{path.resolve()}"')
     if written:
-        first = f" (rille init {shlex.quote(seq)} --force writes one)" if Path(seq).is_dir() else ""
+        first = f" (rille init {shell_word(seq)} --force writes one)" if Path(seq).is_dir() else ""
         print(f"next         look at the .look.png; then in the manifest{first}:\n\n[masks]")
         print("\n".join(written))

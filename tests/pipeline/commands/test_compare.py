@@ -27,6 +27,7 @@ def test_a_failed_task_has_no_result(tmp_path: Path) -> None:
     assert head.split(maxsplit=1)[1] == "1 with the same result, 1 with another"
     assert {line.strip() for line in stages} == {
         "other: 1 another result of equal inputs",
+        f"by the manifest, parameters, files or code: rille why {tmp_path.name}/b other",
         "fails: 1 in A alone",
         "more: 1 in B alone",
         "broken: 1 without a result in both",
@@ -47,6 +48,7 @@ def test_where_a_difference_begins_is_said(tmp_path: Path) -> None:
     assert [line.strip() for line in stages] == [
         "mask: 1 another result of equal inputs",
         "match: 1 another result",
+        f"by the manifest, parameters, files or code: rille why {tmp_path.name}/b mask",
     ]
 
 

@@ -78,6 +78,39 @@ def test_next_steps_are_as_a_shell_takes_them(drive, tmp_path, capsys):
     assert f"rille check '{tmp_path}/here/my drive.toml'" in capsys.readouterr().out
 
 
+def test_no_path_of_the_next_steps_is_an_option(drive, monkeypatch, capsys):
+    monkeypatch.chdir(drive.parent)
+    drive.rename("-x")
+    init(Path("./-x"), output=Path("./-y.toml"))
+    assert "rille check ./-y.toml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "names", [["mask_left.png", "mask_right.png"], ["masks/cam0.png", "masks/cam1.png"], ["mask_l.png"]]
+)
+def test_masks_of_the_cameras_are_taken(drive, capsys, names):
+    (drive / "calibration.yaml").write_text(SETTINGS)
+    (drive / "masks").mkdir()
+    for name in [*names, names[0].replace(".", ".look.")]:
+        cv2.imwrite(str(drive / name), np.where(np.arange(48)[:, None] < 40, 255, np.zeros((48, 64), np.uint8)))
+    init(drive)
+    printed = capsys.readouterr().out
+    assert f"masks        {', '.join(names)}" in printed
+    assert "not read" not in printed
+    assert [path.name for path in open_manifest(Path("drive.rille.toml"), Digests()).masks.values()] == [
+        Path(name).name for name in names
+    ]
+
+
+def test_masks_of_each_image_are_not_those_of_the_cameras(drive, capsys):
+    for side in ("left", "right"):
+        (drive / "mask" / side).mkdir(parents=True)
+        for k in range(2):
+            cv2.imwrite(str(drive / "mask" / side / f"{k}.png"), np.zeros((48, 64), np.uint8))
+    init(drive)
+    assert "not read     mask/left/*.png and its right images: no photographs" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("place", "root"), [(".", "drive"), ("drive/left", ".."), ("far/away", None)])
 def test_elsewhere_the_manifest_still_finds_its_folder(drive, tmp_path, place, root):
     (drive / "calibration.yaml").write_text(SETTINGS)
@@ -120,9 +153,12 @@ def test_a_folder_that_opens_as_it_is_gets_no_manifest_unasked(drive, tmp_path, 
     (drive / "calib.txt").write_text("\n".join(rows))
     init(drive)
     printed = capsys.readouterr().out
-    assert f"{drive} opens as it is" in printed
+    assert f"{drive} opens as it is; " in printed
     assert f"rille reconstruct {drive}\n" in printed
     assert not list(drive.glob("*.toml"))
+    cv2.imwrite(str(drive / "mask_right.png"), np.full((48, 64), 255, np.uint8))
+    init(drive)
+    assert f"{drive} opens as it is, without mask_right.png; " in capsys.readouterr().out
     init(drive, output=tmp_path / "m.toml")
     assert (tmp_path / "m.toml").is_file()
 

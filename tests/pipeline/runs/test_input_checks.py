@@ -59,6 +59,8 @@ def test_times():
     gap = judged(0.0, 0.1, 0.2, 0.6, 0.7)
     assert gap.level == "WARN"
     assert "0.4 s from frame 2 to 3" in gap.text
+    some = recorded(8, times=tuple(0.1 * k for k in range(8)))[0]
+    assert "0.4 s from frame 2 to 6" in input_checks.judge_times(some, [0, 1, 2, 6, 7]).text
     back = judged(0.0, 0.1, 0.1, 0.2)
     assert back.level == "FAIL"
     assert "frame 1 to 2" in back.text

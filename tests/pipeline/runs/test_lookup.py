@@ -26,6 +26,11 @@ def test_a_run_is_complete_once_its_files_are_written(tmp_path):
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "unfinished"]
     events.add_facts(run / lookup.LEDGER, total=1.0)
     assert [line.split()[1] for line in runs.describe([run])] == ["state", "complete"]
+    events.add_facts(run / lookup.LEDGER, holes=3)  # as the report counts, although no task has failed
+    assert [line.split()[1:3] for line in runs.describe([run])][1] == ["3", "missing"]
+    events.add_facts(run / lookup.LEDGER, holes=0, part=True)
+    assert [line.split()[1:3] for line in runs.describe([run])][1] == ["a", "part"]
+    events.add_facts(run / lookup.LEDGER, part=False)
     report = {"frames": [{"posed": True}, {"posed": False}], "metrics": {"trajectory_drift": {"value": 0.1234}}}
     (run / "report.json").write_text(json.dumps(report))
     assert [*runs.describe([run])][1].split()[-4:] == ["1.0", "1/2", "0.123", "%"]
@@ -45,7 +50,8 @@ def test_runs_are_found_by_the_names_that_users_type(tmp_path, linked):
     if linked:
         (tmp_path / "runs/b/latest").symlink_to("20260102")
     assert lookup.all_runs(tmp_path / "runs") == every
-    known = {"latest": 0, "a": 0, "b": 2, "20260101": 1, "b/20260101": 1, str(every[1]): 1}
+    known = {str(tmp_path / "runs/b"): 2} if linked else {}
+    known |= {"latest": 0, "a": 0, "b": 2, "20260101": 1, "b/20260101": 1, str(every[1]): 1}
     assert {text: lookup.find(text, tmp_path / "runs") for text in known} == {t: every[k] for t, k in known.items()}
     with raises("RIL-067", "20260103"):
         lookup.find("20260104", tmp_path / "runs")

@@ -41,16 +41,21 @@ def moved(poses: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> n
 
 
 def run(
-    ours: np.ndarray, theirs: np.ndarray, piece: np.ndarray | None = None, lines: np.ndarray | None = None
+    ours: np.ndarray,
+    theirs: np.ndarray,
+    piece: np.ndarray | None = None,
+    lines: np.ndarray | None = None,
+    covariance: np.ndarray | None = None,
 ) -> Bundle:
     piece = np.where(np.isfinite(theirs[:, 0, 0]), 0, -1) if piece is None else piece
     frames = list(range(10, 10 + len(ours)))
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
     arrays = {"poses": theirs, "piece": piece.astype(np.int16)}
     arrays["line_distance"] = np.full(len(ours), 0.2) if lines is None else lines
-    other = Bundle(arrays, {"frames": frames, "pieces": pieces})
+    trajectory = {"poses": ours} if covariance is None else {"poses": ours, "own_covariance": covariance}
+    given = {"trajectory": Bundle(trajectory, {"frames": frames})}
     out = agreement_stage.run(
-        NoParams(), {}, {"trajectory": Bundle({"poses": ours}, {"frames": frames}), "crosscheck": other}
+        NoParams(), {}, given | {"crosscheck": Bundle(arrays, {"frames": frames, "pieces": pieces})}
     )
     check_outputs(agreement_stage, out)
     return out
@@ -105,6 +110,20 @@ def test_noise_alone_is_not_flagged() -> None:
     assert [len(run(ours, noisy(ours, seed)).meta["flagged"]) for seed in range(5)] == [0] * 5
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_the_stated_errors_explain_is_not_flagged(seed: int) -> None:
+    """Chains whose errors are as stated: of few frames that agree well by chance the next one would stand out."""
+    n, step = 6, 1e-4
+    ours, walk = drive(n), np.cumsum(RNG(seed).normal(scale=step, size=(n, 3)), axis=0)
+    theirs = ours.copy()
+    theirs[:, :, 3] += walk
+    theirs[-1, :, 3] += 4.0 * step
+    grown = np.arange(n)[:, None, None] * np.diag([step**2] * 3 + [1e-12] * 3)
+    assert run(ours, theirs, covariance=grown).meta["flagged"] == []
+    theirs[3, :, 3] += 60.0 * step
+    assert 13 in [frame["frame"] for frame in run(ours, theirs, covariance=grown).meta["flagged"]]
+
+
 def test_the_limit_by_hand() -> None:
     """Median 2, deviations 1 1 0 1 8, MAD 1: limit 2 + 5 * 1.4826; angles of microradians are beneath notice."""
     values = np.array([1.0, 1.0, 2.0, 3.0, 10.0])
@@ -115,10 +134,10 @@ def test_the_limit_by_hand() -> None:
         "step_angle": values * np.nan,
         "line_distance": 0.1 * values,
     }
-    flags, limits = flag(arrays)
+    flags, limits = flag(arrays, {"step_distance": 1.5})
     assert limits["distance"] == pytest.approx(9.413)
     assert limits["angle"] == pytest.approx(math.radians(0.05))
-    assert limits["step_distance"] == 6.0
+    assert limits["step_distance"] == 7.5  # five of those stated
     assert limits["step_angle"] is None
     assert flags.tolist() == [0, 0, 0, 0, 1]
 
