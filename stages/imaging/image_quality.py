@@ -30,6 +30,10 @@ MIN_CONTRAST_GREY = 2.5
 """Standard deviation of an image's grey values, of 255, below which noise and rounding hide its landmarks: rendered
 ground with noise of 0.8 gave all poses down to 2.8, and none from 2.4 on."""
 
+MIN_NOISE_SHARPNESS, MIN_NOISE_DETAIL = 4.3, 0.18
+"""Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`texture`); photographs have a
+sharpness of about 1, or, with strong noise, a smaller detail: their grey values deviate by more than the noise."""
+
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and three times the reach of the wider blur."""
 
@@ -89,6 +93,12 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
         **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
+
+
+def noise_alone(seen: Mapping[str, Any]) -> bool:
+    """Whether an image shows uncorrelated noise and nothing else, as behind a lens cap; ``seen``: by :func:`glance`."""
+    sharp = seen["sharpness"]
+    return sharp is not None and sharp > MIN_NOISE_SHARPNESS and seen["detail"] > MIN_NOISE_DETAIL
 
 
 def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:

@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows, noise_alone
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -137,9 +137,14 @@ def _see(
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
     for side in SIDES:
-        usual = {what: _usual([qualities[f][side][what] for f in frames]) for what in ("sharpness", "detail")}
+        noise = {f for f in frames if noise_alone(qualities[f][side])}
+        shown = [qualities[f][side] for f in frames if f not in noise]
+        usual = {what: _usual([seen[what] for seen in shown]) for what in ("sharpness", "detail")}
         for f in frames:
             seen = qualities[f][side]
+            if f in noise:
+                (out.lost if side == "left" else out.unfit).setdefault(f, f"{side} image of noise alone")
+                continue
             if seen["deviation"] < params.uniform:
                 kind = "empty" if seen["mean"] is None else next(word for up, word in GREYS if seen["mean"] <= up)
                 words = seen.get("damage") or (

@@ -72,6 +72,17 @@ def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
     assert "blurred left image" in found(alone, qualities).lost[3]
 
 
+def test_frames_of_noise_alone_make_no_pairs_however_many_and_blur_none_of_the_others():
+    noise = {"mean": 3.0, "deviation": 1.5, "sharpness": 4.6, "detail": 0.19}
+    qualities = {k: sight(k) for k in range(7)}
+    for k in range(3, 7):  # more than half: a cap on the right lens
+        qualities[k]["right"] |= noise
+    out = found({}, qualities)
+    assert out.unfit == dict.fromkeys(range(3, 7), "right image of noise alone")
+    assert not out.lost
+    assert found({}, {k: sight(k, **(noise if k == 6 else {})) for k in range(7)}).lost == {6: "left image of noise alone"}
+
+
 def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
     qualities = {k: sight(k) for k in range(7)} | {3: sight(3, detail=0.02, sharpness=0.9)}
     assert found({}, qualities).unfit == {3: "blurred left image (20% of the usual detail)"}
