@@ -80,7 +80,9 @@ def test_frames_of_noise_alone_make_no_pairs_however_many_and_blur_none_of_the_o
     out = found({}, qualities)
     assert out.unfit == dict.fromkeys(range(3, 7), "right image of noise alone")
     assert not out.lost
-    assert found({}, {k: sight(k, **(noise if k == 6 else {})) for k in range(7)}).lost == {6: "left image of noise alone"}
+    assert found({}, {k: sight(k, **(noise if k == 6 else {})) for k in range(7)}).lost == {
+        6: "left image of noise alone"
+    }
 
 
 def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
