@@ -38,35 +38,45 @@ STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and three times the reach of the wider blur."""
 
 
-def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
-    """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: no pixel is usable.
+ALONG = {"sharpness": (1, 1), "sharpness_rows": (1, 0), "sharpness_columns": (0, 1)}
+"""Directions (column, row) in which sharpness is measured: motion blurs an image along one of them alone."""
+
+
+def texture(image: NDArray[Any], valid: Bytes) -> tuple[tuple[float, ...], float]:
+    """Sharpness (both ways, along rows, along columns) and detail of an image (row, col); ``valid`` not zero where
+    usable. NaN: no pixel is usable.
 
     Sharpness is the detail between one and two pixels over that between two and four, RMS: it hardly depends on the
-    scene, but decreases with blur. Detail is the latter over the standard deviation: without it noise alone determines
-    the sharpness.
+    scene, but decreases with blur. Detail is the latter, both ways, over the standard deviation: without it noise alone
+    determines the sharpness.
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
     inner = None
     if not usable.all():
         if not usable.any():
-            return math.nan, 0.0
+            return (math.nan,) * len(ALONG), 0.0
         level = np.where(usable, level, level[usable].mean())
         # Three standard deviations of the wider blur, within which the mask changes the result.
         inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
-    once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
     count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
-    coarse, fine = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((once, twice), (level, once)))
+    scales = list[tuple[float, float]]()
+    for x, y in ALONG.values():
+        # 1e-3 pixels: no blur in that direction.
+        once, twice = (cv2.GaussianBlur(level, (0, 0), max(s * x, 1e-3), None, max(s * y, 1e-3)) for s in (1.0, 2.0))
+        fine, coarse = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((level, once), (once, twice)))
+        scales.append((fine, coarse))
     deviation = float(cv2.meanStdDev(level, mask=None if inner is None else usable.astype(np.uint8))[1][0, 0])
-    return fine / coarse if coarse > 0 else math.nan, coarse / deviation if deviation > 0 else 0.0
+    sharpness = tuple(fine / coarse if coarse > 0 else math.nan for fine, coarse in scales)
+    return sharpness, scales[0][1] / deviation if deviation > 0 else 0.0
 
 
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
     ``mean`` (None: no pixel is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped
-    pixels; ``sharpness`` (None: unknown) and ``detail`` of strips; ``digest`` of the pixels; if large, share
-    ``grey_rows`` of the rows that have one value, neither black nor white.
+    pixels; of strips ``sharpness``, also along ``_rows`` and ``_columns`` (None: unknown), and ``detail``; ``digest``
+    of the pixels; if large, share ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
     # (0.25, 0.5, 0.75): positions over the height of strips, which represent the image.
@@ -74,7 +84,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in (0.25, 0.5, 0.75)}
     )
     textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
-    sharp = [s for s, _ in textures if math.isfinite(s)]
+    sharp = [s for s, _ in textures if all(map(math.isfinite, s))]
+    sharpness = [float(of) for of in np.median(sharp, axis=0)] if sharp else [None] * len(ALONG)
     # A quarter of the pixels is enough for mean and deviation.
     thinned = grey(np.ascontiguousarray(image[::2, ::2]))
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
@@ -88,7 +99,7 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "deviation": float(deviation),
         "dark": float((usable <= MAX_DARK_GREY).mean()) if usable.size else 0.0,
         "bright": float((usable >= MIN_BRIGHT_GREY).mean()) if usable.size else 0.0,
-        "sharpness": float(np.median(sharp)) if sharp else None,
+        **dict(zip(ALONG, sharpness, strict=True)),
         "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
         **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),

@@ -28,7 +28,7 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows, noise_alone
+from rille.stages.imaging.image_quality import ALONG, MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows, noise_alone
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -136,10 +136,11 @@ def _see(
     out: Judgement, frames: Sequence[int], qualities: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
+    limits = {**dict.fromkeys(ALONG, params.blurred), "detail": 0.5 * params.blurred}
     for side in SIDES:
         noise = {f for f in frames if noise_alone(qualities[f][side])}
         shown = [qualities[f][side] for f in frames if f not in noise]
-        usual = {what: _usual([seen[what] for seen in shown]) for what in ("sharpness", "detail")}
+        usual = {what: _usual([seen[what] for seen in shown]) for what in limits}
         for f in frames:
             seen = qualities[f][side]
             if f in noise:
@@ -152,10 +153,11 @@ def _see(
                 )
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
                 continue
-            for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):
+            for what, limit in limits.items():
                 share = seen[what] / usual[what] if seen[what] is not None and usual[what] > 0 else 1.0
                 if share < limit:
-                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
+                    words = what.replace("_", " along the ")
+                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {words})")
     digests = {f: [qualities[f][side]["digest"] for side in SIDES] for f in frames}
     for f in frames:
         if digests[f][0] == digests[f][1] and f not in out.lost:

@@ -10,13 +10,14 @@ from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.imaging.image_quality import ALONG
 from rille.stages.odometry.frame_screening import FrameScreeningParams, frame_screening_stage, judge
 
 PARAMS = FrameScreeningParams()
 
 
 def sight(k, **left):
-    good = {"mean": 100.0, "deviation": 40.0, "sharpness": 0.5, "detail": 0.1}
+    good = {"mean": 100.0, "deviation": 40.0, **dict.fromkeys(ALONG, 0.5), "detail": 0.1}
     return {"left": good | {"digest": f"L{k}"} | left, "right": good | {"digest": f"R{k}"}}
 
 
@@ -63,10 +64,11 @@ def test_a_black_frame_is_lost_whatever_matches_and_is_bridged():
     assert found({(2, 4): 0.6}, qualities).lost == {3: "left image 3.png is damaged"}
 
 
-def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
-    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, sharpness=0.2)}
+@pytest.mark.parametrize(("what", "words"), [("sharpness", ""), ("sharpness_rows", " along the rows")])
+def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it(what, words):
+    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, **{what: 0.2})}
     out = found({}, qualities)
-    assert out.unfit == {3: "blurred left image (40% of the usual sharpness)"}
+    assert out.unfit == {3: f"blurred left image (40% of the usual sharpness{words})"}
     assert not out.lost
     alone = {(2, 3): 0.05, (3, 4): 0.05, (2, 4): 0.1}
     assert "blurred left image" in found(alone, qualities).lost[3]
