@@ -124,8 +124,9 @@ def unlike_sides(sides: Mapping[int, Mapping[str, Any]]) -> dict[int, str]:
     for f, facts in sides.items():
         fit = facts.get("as_given", best)
         if facts["swapped"]:
-            words = f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides"
-            out[f] = f"{words} exchanged, {fit:.0%} as given)"
+            words = "left and right are swapped, or both upside down or mirrored"
+            fits = f"{facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged, {fit:.0%} as given"
+            out[f] = f"{words} ({fits})"
         elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
             words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
             out[f] = f"{words} {best:.0%})"
