@@ -42,6 +42,10 @@ SIMULTANEOUS_SHARE = 0.6
 """Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
 a frame are not of one time. A best share below it is that of a wrong rig, and tells nothing of the times."""
 
+TURNED_SHARE = 0.95
+"""The like once the right camera is turned back, above which it was knocked: moved mounts give 0.97 or more, images of
+two times at most 0.9, of a lift straight over ground."""
+
 
 class FrameScreeningParams(Params):
     """When a frame counts as lost, or as unfit to be basic.
@@ -127,7 +131,11 @@ def unlike_sides(sides: Mapping[int, Mapping[str, Any]]) -> dict[int, str]:
             words = "left and right are swapped, or both upside down or mirrored"
             fits = f"{facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged, {fit:.0%} as given"
             out[f] = f"{words} ({fits})"
-        elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
+        elif (
+            best > SIMULTANEOUS_SHARE
+            and fit < SIMULTANEOUS_SHARE * best
+            and facts.get("as_turned", fit) < TURNED_SHARE * best
+        ):
             words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
             out[f] = f"{words} {best:.0%})"
     return out
