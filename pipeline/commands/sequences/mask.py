@@ -18,7 +18,6 @@ from rille.stages.core.quantities import count
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
-
 MAX_STILL = 0.95
 """Share of an image that keeps its place, beyond which the camera stood; no mask may leave out more."""
 
