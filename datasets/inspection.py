@@ -258,7 +258,8 @@ def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list
     # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
     if any(min(map(len, sides)) > 1 for sides in both.values()):
         return {}
-    parts = {word: [images[i] for i in of] for word, of in pairing.by_one_word(names).items()}
+    words = pairing.by_one_word(names) or pairing.by_one_word(names, timed=True)
+    parts = {word: [images[i] for i in of] for word, of in words.items()}
     lefts = {path for left, _ in both.values() for path in left}
     return {} if both and any(lefts <= set(of) for of in parts.values()) else parts
 

@@ -122,6 +122,8 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
         ("cam1/cam1_{}.png", "cam2/cam2_{}.png", ("cam1/cam1_*.png", "cam2/cam2_*.png")),
         ("A/image_{}.png", "B/image_{}.png", ("A/image_*.png", "B/image_*.png")),
         ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
+        ("a/acA__22345678__20260503_10111{}123_07.png", "b/acA__22345679__20260503_10111{}131_07.png", None),
+        ("cam-40012345__1700000000.{}10.png", "cam-40012399__1700000000.{}14.png", None),
         ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
     ],
 )
