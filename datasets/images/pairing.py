@@ -322,6 +322,9 @@ def pair_up(
     if _begun_anew(_ascending([names[path] for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
+    if two := " and ".join(map(repr, by_one_word([names[path] for path in left]))):
+        text = f"images of {two} are taken one after the other, as one sequence"
+        lines.append(warning("RIL-835", f"{text}; if they are two, give each a manifest (images.left, images.right)"))
     joined = join(*times, tolerance) if all(times := (_fine_times(left), _fine_times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
     rule = rule if rule != "auto" else _fitting(left, right, names, joined)
