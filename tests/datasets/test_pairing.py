@@ -376,7 +376,7 @@ def test_a_date_that_all_names_share_is_no_time_stamp():
 @pytest.mark.parametrize(
     ("stems", "told"),
     [
-        (["run1_0", "run1_1", "run2_0", "run2_1"], True),
+        ([f"run{run}_{k}" for run in (1, 2) for k in range(3)], True),
         (["0_long", "0_short", "1_long", "1_short"], True),
         (["0", "1", "10", "11"], False),
         (["run1_0", "run1_1", "run1_2"], False),
