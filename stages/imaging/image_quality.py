@@ -106,10 +106,14 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     }
 
 
+def drowned(seen: Mapping[str, Any]) -> bool:
+    """Whether all fine detail of an image is uncorrelated noise; ``seen``: by :func:`glance`."""
+    return seen["sharpness"] is not None and seen["sharpness"] > MIN_NOISE_SHARPNESS
+
+
 def noise_alone(seen: Mapping[str, Any]) -> bool:
     """Whether an image shows uncorrelated noise and nothing else, as behind a lens cap; ``seen``: by :func:`glance`."""
-    sharp = seen["sharpness"]
-    return sharp is not None and sharp > MIN_NOISE_SHARPNESS and seen["detail"] > MIN_NOISE_DETAIL
+    return drowned(seen) and seen["detail"] > MIN_NOISE_DETAIL
 
 
 def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:

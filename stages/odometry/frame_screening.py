@@ -28,7 +28,15 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import ALONG, MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows, noise_alone
+from rille.stages.imaging.image_quality import (
+    ALONG,
+    MAX_DARK_GREY,
+    MIN_BRIGHT_GREY,
+    drowned,
+    faint,
+    grey_rows,
+    noise_alone,
+)
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -147,14 +155,11 @@ def _see(
     """Judge frames by their images alone: uniform, blurred, copied."""
     limits = {**dict.fromkeys(ALONG, params.blurred), "detail": 0.5 * params.blurred}
     for side in SIDES:
-        noise = {f for f in frames if noise_alone(qualities[f][side])}
-        shown = [qualities[f][side] for f in frames if f not in noise]
+        # Noise is sharper than any photograph.
+        shown = [seen for f in frames if not drowned(seen := qualities[f][side])]
         usual = {what: _usual([seen[what] for seen in shown]) for what in limits}
         for f in frames:
             seen = qualities[f][side]
-            if f in noise:
-                (out.lost if side == "left" else out.unfit).setdefault(f, f"{side} image of noise alone")
-                continue
             if seen["deviation"] < params.uniform:
                 kind = "empty" if seen["mean"] is None else next(word for up, word in GREYS if seen["mean"] <= up)
                 words = seen.get("damage") or (
@@ -162,6 +167,11 @@ def _see(
                 )
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
                 continue
+            if noise_alone(seen):
+                (out.lost if side == "left" else out.unfit).setdefault(f, f"{side} image of noise alone")
+                continue
+            if drowned(seen) and shown:
+                out.unfit.setdefault(f, f"{side} image drowned in noise, unlike others")
             for what, limit in limits.items():
                 share = seen[what] / usual[what] if seen[what] is not None and usual[what] > 0 else 1.0
                 if share < limit:
