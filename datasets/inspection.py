@@ -49,7 +49,9 @@ ODOMETRY, TRUTH = re.compile("odom|wheel|encoder", re.I), re.compile("truth|(?<!
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
 
-COMPUTED = re.compile(r"(?<![a-z])(depth|disp|seg|mask|valid|flow|label|conf|normal|dem(?![a-z]))", re.I)
+COMPUTED = re.compile(
+    r"(?<![a-z])(depth|disp|seg|mask|valid|flow|label|conf|normal|occl|semantic|instance|dem(?![a-z]))", re.I
+)
 """In the names of images and arrays that are no photographs, as beside those of simulators."""
 
 PROSE = re.compile(r"read.?me|licen[cs]e|copying|changes", re.I)
@@ -283,9 +285,18 @@ def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list
     # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
     if any(min(map(len, sides)) > 1 for sides in both.values()):
         return {}
-    parts = {word: [images[i] for i in of] for word, of in pairing.by_one_word(names).items()}
+    words = pairing.by_one_word(names) or pairing.by_one_word(names, timed=True)
+    parts = {word: [images[i] for i in of] for word, of in words.items()}
     lefts = {path for left, _ in both.values() for path in left}
     return {} if both and any(lefts <= set(of) for of in parts.values()) else parts
+
+
+def _sets(folder: Path, images: list[Path]) -> tuple[Sets, dict[str, list[Path]], list[int]]:
+    """Sets of both sides by tokens, images by the one word that differs, and the numbers of left and right images."""
+    names = [_relative(path.with_suffix(""), folder) for path in images]
+    groups = _by_token(images, names)
+    both = _of_both_sides(groups)
+    return both, _by_word(images, names, both), [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)]
 
 
 def find_views(folder: Path, images: list[Path]) -> FoundImages:
@@ -296,18 +307,21 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     InputError
         Names do not distinguish the images of two cameras.
     """
-    names, lines, tokens = [_relative(path.with_suffix(""), folder) for path in images], list[str](), pairing.SIDES
-    groups = _by_token(images, names)
-    both = _of_both_sides(groups)
-    if parts := _by_word(images, names, both):
+    lines, tokens = list[str](), pairing.SIDES
+    photographs = [path for path in images if not COMPUTED.search(_relative(path, folder))]
+    both, parts, counts = _sets(folder, photographs)
+    if not both and not parts:
+        photographs = images
+        both, parts, counts = _sets(folder, images)
+    if parts:
         first, second = parts
         both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
-        raise _no_pairs(folder, images, [sum(len(sides[s]) for sides in groups.values()) for s in (0, 1)])
-    # Photographs first, then most pairs; of equally many the surest token (SIDES), and the shortest name.
-    key = max(both, key=lambda k: (not COMPUTED.search(k[1]), min(len(s) for s in both[k]), -k[0], -len(k[1])))
+        raise _no_pairs(folder, images, counts)
+    # Most pairs; of equally many the surest token (SIDES), and the shortest name.
+    key = max(both, key=lambda k: (min(len(s) for s in both[k]), -k[0], -len(k[1])))
     left, right = both[key]
     sizes, trouble, matched = None, "", tuple[ImagePair, ...]()
     try:
@@ -317,10 +331,11 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    sets = [(pattern(of[0], folder), COMPUTED.search(at[1])) for at, of in both.items() if at != key]
-    others = [f"{of} and its right images: {'no photographs' if made else 'of another set'}" for of, made in sets]
+    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
-    alone = [_relative(path, folder) for path in images if path not in paired]
+    alone = [_relative(path, folder) for path in photographs if path not in paired]
+    if computed := [_relative(path, folder) for path in images if path not in set(photographs)]:
+        others.append(f"{count(len(computed), 'image')} ({computed[0]} ...): computed, by the names")
     if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):
         taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
         lines.append(f"{taken}; if they are frames of one, name its folder left or right")
@@ -495,7 +510,9 @@ def table_kind(path: Path, pairs: int) -> str:
     if untimed(table) and len(table.rows) == pairs:
         return "truth"
     if matrix_at(table) is not None or (meanings(table).keys() >= {"x", "y", *QUATERNION} and not table.crs):
-        return "truth"
+        # Of cameras or sensors, as "image_00: ...", or a single one, it says where they are mounted.
+        mounts = table.rows[0][0].endswith(":") or (len(table.rows) == 1 < pairs and "time" not in meanings(table))
+        return "" if mounts else "truth"
     positions = positions_of(table, "csv", {}) if meanings(table).keys() >= {"x", "y"} else None
     # Without times or names of images there must be one for each pair.
     if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
@@ -506,7 +523,8 @@ def table_kind(path: Path, pairs: int) -> str:
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
         return "truth"
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
-    if (row.size == 1 and len(table.rows) == pairs) or (row.size <= 3 and named):
+    rising = row.size == 1 and len(table.rows) == pairs and bool((np.diff(table.values([0]), axis=0) > 0).all())
+    if (rising and not CAMERA_WORDS.search(path.stem)) or (row.size <= 3 and named):
         return "times"
     # Names of images, dates and the like are no numbers.
     return named if np.isinf(row).any() else ""

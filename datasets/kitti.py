@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rille.datasets.cameras import read_cameras
-from rille.datasets.images.files import Digests
+from rille.datasets.images.files import SUFFIXES, Digests
 from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth
 from rille.datasets.manifest.opening import open_described
 from rille.datasets.manifest.rig import CAR, STREET
@@ -40,8 +40,13 @@ FORMS = (
 
 
 def image_folders(folder: Path) -> tuple[str, str] | None:
-    """The pair of image folders in a folder; None: there is none."""
-    return next((p for p in PAIRS if all((folder / side).is_dir() for side in p)), None)
+    """The pair of image folders in a folder, those with images first; None: there is none."""
+    there = [sides for sides in PAIRS if all((folder / side).is_dir() for side in sides)]
+    for sides in there:
+        if all(any(f.suffix.lower() in SUFFIXES for f in (folder / side).iterdir()) for side in sides):
+            return sides
+    # Images may be still to come, or of a kind that is not read, but not in folders below.
+    return next((p for p in there if not any(f.is_dir() for side in p for f in (folder / side).iterdir())), None)
 
 
 def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | None:

@@ -108,6 +108,16 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
         if not isinstance(error.__cause__, YAMLError) or path.suffix.lower() in (".yaml", ".yml", ".json"):
             raise
         fields = Fields({}, str(path))
+    parts = [key for key, value in fields.values.items() if isinstance(value, dict)]
+    # All of it may stand in one part, as in {"calibration": {...}, "date": ...}.
+    for whole in (fields, fields.with_parts({parts[0]: ""})) if len(parts) == 1 else (fields,):
+        if found := _nested(whole, path):
+            return found
+    raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)
+
+
+def _nested(fields: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of nested entries; empty if these are of no known format."""
     for knows, read_fields in NESTED:
         if knows(fields):
             found = read_fields(fields, path)
@@ -116,7 +126,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
                 fields.check_turn()
                 found = _parallel(found, fields, path)
             return found
-    raise InputError("RIL-100", f"{path} holds no camera that is known", remedy=KNOWN)
+    return []
 
 
 def _parallel(found: list[CalibratedCamera], fields: Fields, path: Path) -> list[CalibratedCamera]:

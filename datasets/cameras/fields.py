@@ -47,7 +47,9 @@ LENS = re.compile(
 )
 """Keys of a lens: their value is the name of its model, or its coefficients."""
 
-COEFFICIENT = re.compile(r"(^|[._ ])(k\d|p[12]|s[1-4]|xi|tau_?[xy])$|distor|radial|tangential|coef", re.I)
+COEFFICIENT = re.compile(
+    r"(^|[._ ])(k\d|p[12]|s[1-4]|xi(_?(\d|[lr]|left|right))?|tau_?[xy])$|distor|radial|tangential|coef", re.I
+)
 """Keys of single coefficients: K1 and P1 may be matrices, and a single ``dist`` is a distance."""
 
 TURN = re.compile(
@@ -154,6 +156,8 @@ class Fields:
 
     def transform(self, rotation: str, translation: str) -> RigidTransform:
         """Rigid transform from a 3 x 3 matrix and three numbers."""
+        if rotation not in self:
+            self.check_turn()  # it may stand there in another form
         return self.rigid(rotation, self.matrix(rotation, 3, 3), np.array(self.numbers(translation, 3)))
 
     def pose(self, key: str) -> RigidTransform:

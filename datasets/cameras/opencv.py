@@ -10,6 +10,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields, flattened
 from rille.datasets.cameras.model import CalibratedCamera
+from rille.datasets.images.pairing import side_of
 from rille.datasets.protocol import CAMERAS
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
@@ -86,8 +87,9 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def by_side(f: Fields) -> Fields:
-    """Entries with those of ``left`` and ``right`` among them: ``left_K`` for K of ``left``."""
-    return f.with_parts({side: f"{side}_" for side in CAMERAS})
+    """Entries with those of parts for each side among them (``left_K`` for K of ``left``), and of one for the rig."""
+    parts = {key: f"{CAMERAS[at[1]]}_" for key in f.values if (at := side_of(key)) is not None}
+    return f.with_parts(parts | dict.fromkeys(("extrinsics", "extrinsic", "stereo"), ""))
 
 
 def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -21,7 +21,7 @@ from rille.datasets.images.headers import Header, read_header
 from rille.datasets.text.reading import open_regular
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, RilleError
-from rille.stages.imaging.levels import spread
+from rille.stages.imaging.levels import Levels, spread
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE = "sensor_msgs/msg/Image"
@@ -159,7 +159,7 @@ def bag_image_stage(
     message: Message,
     sha256: str,
     header: Header,
-    levels: tuple[int, int] | None = None,
+    levels: Levels | None = None,
 ) -> Bundle[ImageFacts]:
     """One image of a bag, checked and grey."""
     name = f"frame {frame}, {camera} image of {message.path}"

@@ -375,7 +375,7 @@ def image_stage(
     path: str,
     sha256: str,
     header: Header,
-    levels: tuple[int, int] | None = None,
+    levels: Levels | None = None,
 ) -> Bundle[ImageFacts]:
     """One image file, checked and grey."""
     data = read_unchanged(Path(path), sha256, f"frame {frame}, {camera} image {path}")

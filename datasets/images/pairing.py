@@ -242,23 +242,26 @@ def two_sides(names: Iterable[str]) -> list[tuple[str, str]]:
     return [(of[0], of[1]) for of in sides.values() if len(of) == 2]
 
 
-def by_one_word(names: Sequence[str]) -> dict[str, list[int]]:
-    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/A_07 and B/B_07.
+def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[int]]:
+    """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/X_07 and B/Y_07.
 
     In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside. Of
     several one whose words differ by more than a number is taken: A/0, A/1, B/0 and B/1 are two frames of A and of B.
+    ``timed``: time stamps in the names aside, which may differ between the cameras.
     """
     found = []
-    words = [re.split(r"([^\W_]+)", name) for name in names]
+    words = [re.split(r"([^\W_]+)", STAMP.sub("", undated(name)) if timed else name) for name in names]
     places = range(1, min(map(len, words), default=0), 2)
-    for k in places:
-        kinds = sorted({split[k] for split in words}, key=natural)
-        repeated = [j for j in places if len(kinds) == 2 and all(split[j] == split[k] for split in words)]
-        if repeated[:1] != [k]:
+    halves = {k: [w[k] == words[0][k] for w in words] for k in places if len({w[k] for w in words}) == 2}
+    for k, half in halves.items():
+        # Of several words that tell the two apart, as a serial number in a folder of its own, the first.
+        repeated = [j for j, other in halves.items() if other == half]
+        if repeated[0] != k:
             continue
+        kinds = sorted({split[k] for split in words}, key=natural)
         parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
         rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
-        if rest[0] == rest[1] and len(rest[0]) > 1:
+        if rest[0] == rest[1] and (len(rest[0]) > 1 or (timed and min(map(len, parts.values())) > 1)):
             found.append(parts)
     named = [parts for parts in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
     found = named if found[1:] else found
@@ -319,6 +322,9 @@ def pair_up(
     if _begun_anew(_ascending([names[path] for path in left])):
         text = f"the counter of the images began anew: they are taken from {left[0].name} on to {left[-1].name}"
         lines.append(warning("RIL-707", f"{text}; if that is wrong, rename them"))
+    if two := " and ".join(map(repr, by_one_word([names[path] for path in left]))):
+        text = f"images of {two} are taken one after the other, as one sequence"
+        lines.append(warning("RIL-835", f"{text}; if they are two, give each a manifest (images.left, images.right)"))
     joined = join(*times, tolerance) if all(times := (_fine_times(left), _fine_times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
     rule = rule if rule != "auto" else _fitting(left, right, names, joined)

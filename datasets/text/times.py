@@ -83,11 +83,11 @@ def seconds(
             remedy = "put the rows in order of time, each once, in one unit and with all digits"
             raise InputError("RIL-293", text, remedy=remedy)
     usual = float(np.median(np.diff(np.asarray(times)))) if len(times) > 1 else 1.0
-    # 1e8 s: stamps of 1973 and later have a known unit. 3600 s: a wrong unit is likelier than pairs an hour apart.
+    # Stamps of 1973 to 2106 have a known unit. 3600 s: a wrong unit is likelier than pairs an hour apart.
     # 1e-7 s: no camera takes ten million images a second.
-    if (unit == "auto" and times[0] < 1e8 and usual > 3600.0) or usual < 1e-7:
+    if (unit == "auto" and not 1e8 <= times[0] < 2**32 and usual > 3600.0) or usual < 1e-7:
         text = f"times of {what} are {usual:.4g} s apart, if their unit is {stated}"
-        likely = "ns" if usual > 1.0 else "s"
+        likely = next((u for u, per in UNITS.items() if 1e-3 <= usual * UNITS[stated] / per <= 10.0), "ns")
         remedy = f'name the column time_{likely}; those of the pairs have times.unit = "{likely}" in the manifest'
         raise InputError("RIL-687", text, remedy=remedy)
     return times

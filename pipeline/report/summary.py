@@ -116,7 +116,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.frame_words(bad)}")
-    lines += _unlike(figures) + _resting(view.bundle(p.trajectory))
+    lines += _unlike(figures) + (_resting(view.bundle(p.trajectory)) or _to_and_fro(view.bundle(p.trajectory)))
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
@@ -183,6 +183,27 @@ def _resting(trajectory: Bundle | None) -> list[str]:
     return [
         f"by the images the camera stands still, within {far} in all {len(rows)} frames; if it moved, what they show "
         "moves with it or repeats along its way: switch off a projector of dots, mask the vehicle's body or the pattern"
+    ]
+
+
+def _to_and_fro(trajectory: Bundle | None) -> list[str]:
+    """The camera goes back at most of its frames, as where images are not in the order in which they were taken."""
+    poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
+    places = poses[rigid.posed(poses)][:, :, 3]
+    steps = np.diff(places, axis=0)
+    if len(steps) < 6:
+        return []
+    back = np.einsum("ni,ni->n", steps[1:], steps[:-1]) < 0
+    axis = np.linalg.svd(places - places.mean(axis=0))[2][0]
+    long, least = (
+        np.linalg.norm(of, axis=1).sum() for of in (steps, np.diff(places[np.argsort(places @ axis)], axis=0))
+    )
+    # 0.7: noise of a camera that rests for a while adds less to its way.
+    if back.mean() <= 0.5 or least > 0.7 * long:
+        return []
+    return [
+        f"the camera goes back at {int(back.sum())} of {len(back)} frames: {metres(long)}, where its places lie on a "
+        f"way of {metres(least)}; are the images in the order in which they were taken?"
     ]
 
 

@@ -132,7 +132,8 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     turn = float(np.median([image_turn(given, m.left, m.right) for m in pairs]))
     turned = abs(turn) > MAX_IMAGE_TURN_DEG
     # 5.0: largest correction [degrees] of a parameter; a knocked mount, or its baseline, turns by less.
-    far = turned or any(abs(math.degrees(p.value)) > 5.0 for p in decision.parameters)
+    beyond = {p.name for p in decision.parameters if abs(math.degrees(p.value)) > 5.0}
+    far = turned or bool(beyond)
     applied = params.mode != "fixed" and decision.changed and not far and not repeats
     rig = corrected(given, decision.correction) if applied else given
     per_pair = [_alone(given, m, decision, params) for m in pairs]
@@ -150,7 +151,10 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
     # The same points before and after: residuals of two sets of inliers say nothing about a repair.
     before, after = (rms(np.concatenate(one), weights) for one in (of_given, off))
     kept = "not repaired, for what they show repeats" if repeats else "kept because rig.mode = fixed"
-    kept = "not repaired, for no mount moves that far" if far else kept
+    if far:
+        kept = "not repaired, for no mount moves that far"
+        if beyond <= {"baseline_across", "baseline_forward"} and not turned:
+            kept += ": are left and right exposed at one moment? What the camera moves in between adds to the baseline"
     median = float(np.median(np.concatenate(of_given)[weights > 0]))
     hidden = [p for p in decision.parameters if not (p.observed or p.name == shown)]
     warnings = _contradiction(given, median, decision, "repaired" if applied else kept, hidden)

@@ -58,12 +58,13 @@ class RigFacts(CalibrationFacts):
 
 
 class SwapFacts(Facts):
-    """Whether left and right are exchanged: shares of the matches that fit the rig either way."""
+    """Whether left and right are exchanged: shares of the matches that fit the rig either way, or once turned back."""
 
     frame: int
     matches: int
     swapped: bool
     as_given: NotRequired[float]
+    as_turned: NotRequired[float]
     exchanged: NotRequired[float]
 
 

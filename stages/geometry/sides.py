@@ -22,10 +22,21 @@ class BeyondInfinityError(DegenerateError):
     """Most matches lie beyond infinity, though the sides are not exchanged."""
 
 
-def fits(rig: Rig, left: Floats, right: Floats) -> float:
-    """Share of the matches (n, 2), (n, 2) in front of the cameras and on their epipolar lines."""
+def fits(rig: Rig, left: Floats, right: Floats, *, turned: bool = False) -> float:
+    """Share of the matches (n, 2), (n, 2) in front of the cameras and on their epipolar lines.
+
+    ``turned``: once the right camera is turned back about its optical and its horizontal axis, which moves rows alike,
+    and in proportion to the column.
+    """
     tolerance = MAX_LINE_DISTANCE_PX * right_pixels(rig)
     off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
+    if turned:
+        column, line = right[:, 0] - right[:, 0].mean(), np.array([0.0, np.median(off)])
+        for _ in range(6):
+            rest = np.abs(off - np.polyval(line, column))
+            near = rest <= max(tolerance, 2.0 * float(np.median(rest)))
+            line = np.polyfit(column[near], off[near], 1)
+        off = off - np.polyval(line, column)
     with np.errstate(divide="ignore", invalid="ignore"):
         ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
     return float(np.mean((np.abs(off) < tolerance) & ahead))

@@ -30,39 +30,53 @@ MIN_CONTRAST_GREY = 2.5
 """Standard deviation of an image's grey values, of 255, below which noise and rounding hide its landmarks: rendered
 ground with noise of 0.8 gave all poses down to 2.8, and none from 2.4 on."""
 
+MIN_NOISE_SHARPNESS, MIN_NOISE_DETAIL = 4.3, 0.18
+"""Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`texture`); photographs have a
+sharpness of about 1, or, with strong noise, a smaller detail: their grey values deviate by more than the noise."""
+
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and three times the reach of the wider blur."""
 
 
-def texture(image: NDArray[Any], valid: Bytes) -> tuple[float, float]:
-    """Sharpness and detail of an image (row, col); ``valid`` not zero where usable. NaN: no pixel is usable.
+ALONG = {"sharpness": (1, 1), "sharpness_rows": (1, 0), "sharpness_columns": (0, 1)}
+"""Directions (column, row) in which sharpness is measured: motion blurs an image along one of them alone."""
+
+
+def texture(image: NDArray[Any], valid: Bytes) -> tuple[tuple[float, ...], float]:
+    """Sharpness (both ways, along rows, along columns) and detail of an image (row, col); ``valid`` not zero where
+    usable. NaN: no pixel is usable.
 
     Sharpness is the detail between one and two pixels over that between two and four, RMS: it hardly depends on the
-    scene, but decreases with blur. Detail is the latter over the standard deviation: without it noise alone determines
-    the sharpness.
+    scene, but decreases with blur. Detail is the latter, both ways, over the standard deviation: without it noise alone
+    determines the sharpness.
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
     inner = None
     if not usable.all():
         if not usable.any():
-            return math.nan, 0.0
+            return (math.nan,) * len(ALONG), 0.0
         level = np.where(usable, level, level[usable].mean())
         # Three standard deviations of the wider blur, within which the mask changes the result.
         inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
-    once, twice = (cv2.GaussianBlur(level, (0, 0), sigma) for sigma in (1.0, 2.0))
     count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
-    coarse, fine = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((once, twice), (level, once)))
+    scales = list[tuple[float, float]]()
+    for x, y in ALONG.values():
+        # 1e-3 pixels: no blur in that direction.
+        once, twice = (cv2.GaussianBlur(level, (0, 0), max(s * x, 1e-3), None, max(s * y, 1e-3)) for s in (1.0, 2.0))
+        fine, coarse = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((level, once), (once, twice)))
+        scales.append((fine, coarse))
     deviation = float(cv2.meanStdDev(level, mask=None if inner is None else usable.astype(np.uint8))[1][0, 0])
-    return fine / coarse if coarse > 0 else math.nan, coarse / deviation if deviation > 0 else 0.0
+    sharpness = tuple(fine / coarse if coarse > 0 else math.nan for fine, coarse in scales)
+    return sharpness, scales[0][1] / deviation if deviation > 0 else 0.0
 
 
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
     ``mean`` (None: no pixel is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped
-    pixels; ``sharpness`` (None: unknown) and ``detail`` of strips; ``digest`` of the pixels; if large, share
-    ``grey_rows`` of the rows that have one value, neither black nor white.
+    pixels; of strips ``sharpness``, also along ``_rows`` and ``_columns`` (None: unknown), and ``detail``; ``digest``
+    of the pixels; if large, share ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
     # (0.25, 0.5, 0.75): positions over the height of strips, which represent the image.
@@ -70,7 +84,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in (0.25, 0.5, 0.75)}
     )
     textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
-    sharp = [s for s, _ in textures if math.isfinite(s)]
+    sharp = [s for s, _ in textures if all(map(math.isfinite, s))]
+    sharpness = [float(of) for of in np.median(sharp, axis=0)] if sharp else [None] * len(ALONG)
     # A quarter of the pixels is enough for mean and deviation.
     thinned = grey(np.ascontiguousarray(image[::2, ::2]))
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
@@ -84,11 +99,21 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "deviation": float(deviation),
         "dark": float((usable <= MAX_DARK_GREY).mean()) if usable.size else 0.0,
         "bright": float((usable >= MIN_BRIGHT_GREY).mean()) if usable.size else 0.0,
-        "sharpness": float(np.median(sharp)) if sharp else None,
+        **dict(zip(ALONG, sharpness, strict=True)),
         "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
         **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
+
+
+def drowned(seen: Mapping[str, Any]) -> bool:
+    """Whether all fine detail of an image is uncorrelated noise; ``seen``: by :func:`glance`."""
+    return seen["sharpness"] is not None and seen["sharpness"] > MIN_NOISE_SHARPNESS
+
+
+def noise_alone(seen: Mapping[str, Any]) -> bool:
+    """Whether an image shows uncorrelated noise and nothing else, as behind a lens cap; ``seen``: by :func:`glance`."""
+    return drowned(seen) and seen["detail"] > MIN_NOISE_DETAIL
 
 
 def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:

@@ -9,11 +9,16 @@ import numpy as np
 
 from rille.stages.core.declare import AnyArray
 
-Levels = tuple[int, int]
-"""Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped."""
+Levels = tuple[int | None, int]
+"""Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped. Black None: each
+image's own, which makes its median the middle of the range."""
 
 WHITE = 65535
 
+
+MIN_DRIFT = 4
+"""Range of all images over the largest of one, from which on it is the offset of a camera that drifts, as a thermal
+camera's counts do with its temperature."""
 
 OUTLYING = (0.5, 99.5)
 """Percentiles of an image's samples between which they count."""
@@ -28,15 +33,17 @@ def levels_of(images: Iterable[AnyArray]) -> Levels | None:
     deep = _deep(images)
     if not deep:
         return None
-    dark, bright = (
-        int(f(np.percentile(image, q) for image in deep)) for f, q in zip((min, max), OUTLYING, strict=True)
-    )
-    span, top = max(bright - dark, 1), max(int(image.max()) for image in deep)
+    ends = np.array([np.percentile(image, OUTLYING) for image in deep])
+    dark, bright, own = int(ends[:, 0].min()), int(ends[:, 1].max()), max(int(np.ptp(ends, axis=1).max()), 1)
+    drifts = bright - dark >= MIN_DRIFT * own
+    span, top = own if drifts else max(bright - dark, 1), max(int(image.max()) for image in deep)
     # 1 / 8: share of the range, from dark to bright, up to which samples are spread.
     # 1 / 4: share of the range, up to the brightest sample, up to which samples are spread, as of a camera of 14 bits.
     if span > 1 / 8 * WHITE and top > 1 / 4 * WHITE:
         return None
     gain = 1 << (WHITE // (2 * span)).bit_length() - 1
+    if drifts:
+        return (None, gain) if gain > 1 else None
     # Their middle becomes that of the range; black is never raised.
     return (max((dark + bright) // 2 - WHITE // (2 * gain), 0), gain) if gain > 1 else None
 
@@ -61,6 +68,7 @@ def spread(image: AnyArray, levels: Levels | None) -> AnyArray:
     if levels is None or not np.issubdtype(image.dtype, np.uint16):
         return image
     black, gain = levels
+    black = int(np.median(image)) - WHITE // (2 * gain) if black is None else black
     return np.clip((image.astype(np.int64) - black) * gain, 0, WHITE).astype(np.uint16)
 
 
@@ -69,7 +77,8 @@ def words(sides: tuple[Levels | None, Levels | None]) -> list[str]:
     named = {"all": sides[0]} if sides[0] == sides[1] else dict(zip(("left", "right"), sides, strict=True))
     spread_ones = [(name, *levels) for name, levels in named.items() if levels is not None]
     text = "16-bit samples use a small part of their range: (sample - {}) x {} is taken of {} images"
-    return [text.format(black, gain, name) for name, black, gain in spread_ones]
+    drift = "its image's median"
+    return [text.format(drift if black is None else black, gain, name) for name, black, gain in spread_ones]
 
 
 def swapped(image: AnyArray) -> bool:

@@ -28,7 +28,15 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY, faint, grey_rows
+from rille.stages.imaging.image_quality import (
+    ALONG,
+    MAX_DARK_GREY,
+    MIN_BRIGHT_GREY,
+    drowned,
+    faint,
+    grey_rows,
+    noise_alone,
+)
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]
@@ -41,6 +49,10 @@ GREYS = ((MAX_DARK_GREY, "black"), (MIN_BRIGHT_GREY, "uniform"), (np.inf, "white
 SIMULTANEOUS_SHARE = 0.6
 """Share of its matches that fit the rig, of the best share of any frame that was tested, below which left and right of
 a frame are not of one time. A best share below it is that of a wrong rig, and tells nothing of the times."""
+
+TURNED_SHARE = 0.95
+"""The like once the right camera is turned back, above which it was knocked: moved mounts give 0.97 or more, images of
+two times at most 0.9, of a lift straight over ground."""
 
 
 class FrameScreeningParams(Params):
@@ -124,9 +136,14 @@ def unlike_sides(sides: Mapping[int, Mapping[str, Any]]) -> dict[int, str]:
     for f, facts in sides.items():
         fit = facts.get("as_given", best)
         if facts["swapped"]:
-            words = f"left and right are swapped ({facts['exchanged']:.0%} of its matches fit the rig with the sides"
-            out[f] = f"{words} exchanged, {fit:.0%} as given)"
-        elif best > SIMULTANEOUS_SHARE and fit < SIMULTANEOUS_SHARE * best:
+            words = "left and right are swapped, or both upside down or mirrored"
+            fits = f"{facts['exchanged']:.0%} of its matches fit the rig with the sides exchanged, {fit:.0%} as given"
+            out[f] = f"{words} ({fits})"
+        elif (
+            best > SIMULTANEOUS_SHARE
+            and fit < SIMULTANEOUS_SHARE * best
+            and facts.get("as_turned", fit) < TURNED_SHARE * best
+        ):
             words = f"left and right are not of one time ({fit:.0%} of its matches fit the rig, of other frames"
             out[f] = f"{words} {best:.0%})"
     return out
@@ -136,8 +153,11 @@ def _see(
     out: Judgement, frames: Sequence[int], qualities: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
+    limits = {**dict.fromkeys(ALONG, params.blurred), "detail": 0.5 * params.blurred}
     for side in SIDES:
-        usual = {what: _usual([qualities[f][side][what] for f in frames]) for what in ("sharpness", "detail")}
+        # Noise is sharper than any photograph.
+        shown = [seen for f in frames if not drowned(seen := qualities[f][side])]
+        usual = {what: _usual([seen[what] for seen in shown]) for what in limits}
         for f in frames:
             seen = qualities[f][side]
             if seen["deviation"] < params.uniform:
@@ -147,10 +167,16 @@ def _see(
                 )
                 (out.lost if side == "left" else out.unfit).setdefault(f, words)
                 continue
-            for what, limit in (("sharpness", params.blurred), ("detail", 0.5 * params.blurred)):
+            if noise_alone(seen):
+                (out.lost if side == "left" else out.unfit).setdefault(f, f"{side} image of noise alone")
+                continue
+            if drowned(seen) and shown:
+                out.unfit.setdefault(f, f"{side} image drowned in noise, unlike others")
+            for what, limit in limits.items():
                 share = seen[what] / usual[what] if seen[what] is not None and usual[what] > 0 else 1.0
                 if share < limit:
-                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {what})")
+                    words = what.replace("_", " along the ")
+                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {words})")
     digests = {f: [qualities[f][side]["digest"] for side in SIDES] for f in frames}
     for f in frames:
         if digests[f][0] == digests[f][1] and f not in out.lost:

@@ -628,11 +628,36 @@ T44 = np.block([[ROTATION, SHIFT[:, None]], [np.zeros(3), 1.0]]).tolist()
         (TWO | {"R12": ROTATION.tolist(), "T12": SHIFT.tolist()}, "R12"),
         (TWO | {"stereo_pose": np.array(T44)[:3].tolist()}, "stereo_pose"),
         (ONE | {"rmat": ROTATION.ravel().tolist(), "baseline": 0.12}, "rmat"),
+        (TWO | {"om": [0, 0.1, 0], "T": SHIFT.tolist()}, "om"),
     ],
 )
 def test_a_pose_under_another_key_is_refused_beside_matrices_too(tmp_path, stated, key):
     with raises("RIL-766", key):
         read_cameras(written(tmp_path, json.dumps(stated)))
+
+
+PLACED = {"R": ROTATION.tolist(), "T": SHIFT.tolist()}
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"date": "2026-05-31", "calibration": TWO | PLACED},
+        SIDED | {"extrinsics": PLACED},
+        {"left_camera": ONE, "right_camera": ONE, "stereo": PLACED | {"rms": 0.2}},
+    ],
+)
+def test_a_stereo_calibration_in_parts(tmp_path, stated):
+    left, right = read_cameras(written(tmp_path, json.dumps(stated)))
+    assert left.lens.camera.fx == 500
+    np.testing.assert_allclose(right.T_camera_reference.rotation, ROTATION, atol=1e-12)
+    np.testing.assert_allclose(right.T_camera_reference.translation, SHIFT)
+
+
+@pytest.mark.parametrize("key", ["xi1", "xi_left", "left_xi", "xiL"])
+def test_a_mirror_of_one_side_is_no_perspective_lens(tmp_path, key):
+    with raises("RIL-810", key):
+        read_cameras(written(tmp_path, json.dumps(TWO | PLACED | {key: [[1.2]]})))
 
 
 @pytest.mark.parametrize("key", ["IMU.T_b_c1", "Tbc", "cam_to_velodyne"])

@@ -55,6 +55,8 @@ def both(template: str, names: list[str]) -> list[str]:
 
 
 CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
+CAM_3_4 = "A/cam3/rgb/*.png", "A/cam4/rgb/*.png"
+LEFT_RIGHT = "*/left.png", "*/right.png"
 LCAM = "image_lcam/*.png", "image_rcam/*.png"
 
 
@@ -80,6 +82,8 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         (both("{name}/{side}.png", ["aloe", "cones"]), "aloe/left.png", "aloe/right.png", 1),
         ([f"{c}/{k}.png" for c in ("rgb_left", "mono_right") for k in (1, 2)], "rgb_left/*.png", "mono_right/*.png", 2),
         ([f"{c}/{k}.png" for c in "右左" for k in (1, 2)], "左/*.png", "右/*.png", 2),
+        (both("{name}/{side}.png", ["1", "2"]) + both("{name}/{side}_disp.png", ["1", "2"]), *LEFT_RIGHT, 2),
+        ([f"A/cam{c}/{what}/{k}.png" for c in (3, 4) for what in ("rgb", "depth") for k in (1, 2, 3)], *CAM_3_4, 3),
         ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
         ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
         ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
@@ -118,6 +122,8 @@ def test_a_folder_for_each_frame_is_paired_in_the_order_of_the_folders(tmp_path,
         ("cam1/cam1_{}.png", "cam2/cam2_{}.png", ("cam1/cam1_*.png", "cam2/cam2_*.png")),
         ("A/image_{}.png", "B/image_{}.png", ("A/image_*.png", "B/image_*.png")),
         ("NLB_39768133{}EDR_04096M_.png", "NRB_39768133{}EDR_04096M_.png", None),
+        ("a/acA__22345678__20260503_10111{}123_07.png", "b/acA__22345679__20260503_10111{}131_07.png", None),
+        ("cam-40012345__1700000000.{}10.png", "cam-40012399__1700000000.{}14.png", None),
         ("LocCam_2015_{}_0.png", "LocCam_2015_{}_1.png", ("LocCam_2015_*_0.png", "LocCam_2015_*_1.png")),
     ],
 )
@@ -247,7 +253,10 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
         (["image,easting,northing", *(f"img_{k}.jpg,9,48" for k in range(4))], "positions"),
         (["east north", "1 2", "3 4"], "positions"),
         (["east north", "1 2", "3 4", "5 6"], ""),
+        (["image_00: 1 0 0 0 0 1 0 0 0 0 1 0", "image_01: 1 0 0 1 0 1 0 0 0 0 1 0"], ""),
+        (["1 0 0 0 0 1 0 0 0 0 1 0"], ""),
         (["0.0", "0.5"], "times"),
+        (["0.5", "0.5"], ""),
         (["# id timestamp image_name", "0 1600000000.1 a.png", "1 1600000000.2 b.png"], "times"),
         (["0.0", "0.5", "1.0"], ""),
         (["00000 1600000000.1 5.0", "00001 1600000000.2 5.0"], ""),
@@ -273,6 +282,11 @@ def test_dead_reckoning_is_no_truth(tmp_path, name, kind):
 def test_times_stand_in_a_file_that_is_called_so(tmp_path, row):
     write_lines(tmp_path / "times.txt", [row.format(k, 1600000000 + k) for k in range(4)])
     assert table_kind(tmp_path / "times.txt", 2) == "times"
+
+
+def test_a_rising_figure_of_cameras_is_no_time(tmp_path):
+    write_lines(tmp_path / "focaldistance.txt", ["4.1", "4.2"])
+    assert not table_kind(tmp_path / "focaldistance.txt", 2)
 
 
 def test_poses_with_cells_of_text_are_found(tmp_path):
@@ -348,7 +362,7 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     found = inspect(tmp_path)
     assert found.views.left == "left/*.png"
     told = " ".join(found.unread)
-    assert "depth_left/*.png" in told
+    assert "4 images (depth_left/1.png ...): computed" in told
     assert "left/3.jpg" in told
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from raising import raises
 
+from rille.datasets.kitti import image_folders
 from rille.datasets.registry import open_sequence
 from rille.stages.geometry.geometry import rotation_exp
 
@@ -225,6 +226,18 @@ def test_a_number_left_out_of_the_count_is_a_lost_frame(folder, rows):
     assert s.truth[2].translation[2] == pytest.approx(2.0)
     assert s.times == pytest.approx((0.0, 0.1, 0.2, 0.3, 0.4))
     assert (s.truth[1] is None) == (rows == 4)
+
+
+def test_image_folders_are_those_with_images(tmp_path):
+    for name in ("image_0", "image_1", "image_2", "image_3"):
+        (tmp_path / name).mkdir()
+    assert image_folders(tmp_path) == ("image_0", "image_1")  # still to come
+    for name in ("image_2", "image_3"):
+        (tmp_path / name / "000000.png").touch()
+    assert image_folders(tmp_path) == ("image_2", "image_3")
+    (tmp_path / "days" / "left" / "day1").mkdir(parents=True)
+    (tmp_path / "days" / "right" / "day1").mkdir(parents=True)
+    assert image_folders(tmp_path / "days") is None  # `rille init` finds them
 
 
 def test_numbers_in_names_count_as_numbers(folder):

@@ -81,6 +81,11 @@ def test_a_folder_without_a_manifest_is_told_how_to_get_one(tmp_path, capsys):
     (folder / "calib.txt").write_text("90 0 95.5 0 0 90 71.5 0 0 0 1 0\n90 0 95.5 -9 0 90 71.5 0 0 0 1 0\n")
     mask(str(folder), output=tmp_path)
     assert f"rille init '{folder}' --force writes one" in capsys.readouterr().out
+    for k in range(1, 6):  # the left camera stands, and nothing is written
+        cv2.imwrite(str(folder / "left" / f"{k}.png"), cv2.imread(str(folder / "left" / "0.png"), 0))
+    with raises("RIL-910", "100 % of the left images", "stood"):
+        mask(str(folder), output=tmp_path / "standing")
+    assert not (tmp_path / "standing").exists()
 
 
 def test_a_mask_that_changed_since_is_refused(tmp_path, materialise):

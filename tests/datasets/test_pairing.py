@@ -373,6 +373,22 @@ def test_a_date_that_all_names_share_is_no_time_stamp():
         pair_up(left, right, "nearest")
 
 
+@pytest.mark.parametrize(
+    ("stems", "told"),
+    [
+        ([f"run{run}_{k}" for run in (1, 2) for k in range(3)], True),
+        (["0_long", "0_short", "1_long", "1_short"], True),
+        (["0", "1", "10", "11"], False),
+        (["run1_0", "run1_1", "run1_2"], False),
+    ],
+)
+def test_two_sequences_in_one_folder_are_told(stems, told):
+    lines = []
+    left, right = ([Path(side, f"{stem}.png") for stem in stems] for side in ("left", "right"))
+    assert len(pair_up(left, right, warnings=lines)) == len(stems)
+    assert [line[:7] for line in lines] == (["RIL-835"] if told else [])
+
+
 @pytest.mark.parametrize("first", [0, 1])
 def test_a_counter_that_began_anew_goes_on_where_it_ended(first):
     names, lines = [f"{k:03d}.png" for k in (*range(996, 1000), *range(first, 3))], []

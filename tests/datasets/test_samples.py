@@ -107,6 +107,18 @@ def test_hot_pixels_in_the_dark_are_told_from_a_camera_that_stands():
     assert fixed_pattern([np.where(hot, 255, moving[0] + random.normal(0, 1, hot.shape)) for _ in range(3)]) < 0.05
 
 
+@pytest.mark.parametrize(("share", "noise", "step", "told"), [(1, 2, 20, True), (0, 2, 20, False), (1, 25, 0, False)])
+def test_a_reflection_over_all_of_the_view_is_told_from_scenes_that_move_or_rest(tmp_path, share, noise, step, told):
+    random = np.random.default_rng(5)
+    scene, window = (cv2.GaussianBlur(random.random((160, 300)), (0, 0), 1.5) * 300 for _ in range(2))
+    views = [scene[:, step * k : step * k + 192] + share * window[:, :192] for k in range(3)]
+    path = write_sequence(tmp_path, frames=3)
+    for side in ("left", "right"):
+        for image, name in zip(views, sorted((tmp_path / side).glob("*.png")), strict=True):
+            cv2.imwrite(str(name), np.clip(image - 100 + random.normal(0, noise, image.shape), 0, 255).astype(np.uint8))
+    assert sum("RIL-834" in line for line in open_sequence(str(path)).warnings) == (2 if told else 0)
+
+
 def turned(folder, tags, ending="jpg"):
     path = write_sequence(folder, frames=2)
     path.write_text(path.read_text().replace(".png", f".{ending}"))

@@ -44,6 +44,8 @@ def test_small_stamps_are_seconds_unless_stated():
 
 
 def test_small_stamps_in_a_larger_unit_are_refused():
+    with raises("RIL-687", "5e+04 s", 'unit = "us"'):
+        seconds([51_648_500_652 + 50_000 * k for k in range(3)], "t")  # since the start, no year 3606
     with raises("RIL-687", "5e+07 s"):
         seconds([0, 50_000_000, 100_000_000], "t")
     with raises("RIL-687", "1e-10 s", 'unit = "s"'):

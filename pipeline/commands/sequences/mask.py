@@ -18,6 +18,9 @@ from rille.stages.core.quantities import count
 from rille.stages.imaging.pyramid import grey
 from rille.stages.imaging.still import MIN_IMAGES, still
 
+MAX_STILL = 0.95
+"""Share of an image that keeps its place, beyond which the camera stood; no mask may leave out more."""
+
 
 def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> None:
     """Write masks of what keeps its place in the images, such as the vehicle's own body, for `[masks]` of a manifest.
@@ -41,10 +44,15 @@ def mask(seq: str, *, output: Annotated[Path, Output] = Path()) -> None:
         raise InputError("RIL-906", text, remedy="draw the mask by hand")
     # 20 images: more would not change the mask.
     pairs = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, 20).round().astype(int))]
+    taken = {camera: [pair.taken(camera) for pair in pairs] for camera in CAMERAS}
+    bodies = {camera: still(images) for camera, images in taken.items()}
+    for camera, body in bodies.items():
+        if body.mean() > MAX_STILL:
+            text = f"{100 * body.mean():.0f} % of the {camera} images of {seq} keeps its place: the camera stood"
+            raise InputError("RIL-910", text, remedy="give images of a drive, or draw the mask by hand")
     written = []
     for camera, path in paths.items():
-        images = [pair.taken(camera) for pair in pairs]
-        body = still(images)
+        images, body = taken[camera], bodies[camera]
         if not body.any():
             print(f"{camera:12s} nothing keeps its place in {len(images)} images")
             continue

@@ -108,7 +108,7 @@ def test_masks_of_each_image_are_not_those_of_the_cameras(drive, capsys):
         for k in range(2):
             cv2.imwrite(str(drive / "mask" / side / f"{k}.png"), np.zeros((48, 64), np.uint8))
     init(drive)
-    assert "not read     mask/left/*.png and its right images: no photographs" in capsys.readouterr().out
+    assert "images (mask/left/0.png ...): computed, by the names" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("place", "root"), [(".", "drive"), ("drive/left", ".."), ("far/away", None)])

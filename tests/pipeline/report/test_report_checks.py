@@ -81,6 +81,27 @@ def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(s
     assert summary._resting(None) == []
 
 
+@pytest.mark.parametrize(
+    ("places", "told"),
+    [
+        ([1, 0, 3, 2, 5, 4, 7, 6, 9, 8], 1),  # each two in turns
+        ([0, 5, 1, 6, 2, 7, 3, 8, 4, 9], 1),  # two halves mixed
+        (range(10), 0),
+        ([0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0], 0),
+        ([0, 0.001, 0, 0.001, 0, 0.001, 0, 1, 2, 3], 0),  # stood for a while
+    ],
+)
+def test_images_out_of_order_are_asked_for(places, told) -> None:
+    n = len(list(places))
+    poses = np.tile(np.eye(3, 4), (n, 1, 1))
+    poses[:, 2, 3] = list(places)
+    poses[:, 0, 3] = 0.01 * np.arange(n) ** 2
+    meta = {"frames": list(range(n)), "pieces": [list(range(n))], "main": 0}
+    lines = summary._to_and_fro(Bundle({"poses": poses, "piece": np.zeros(n, np.int16)}, meta))
+    assert len(lines) == told
+    assert all("in the order" in line for line in lines)
+
+
 @pytest.mark.parametrize(("angle", "told"), [(0.0025, True), (0.0005, False), (0.0, False)])
 def test_a_toe_in_is_told_where_it_moves_disparities_at_the_sides(angle, told, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera(707.0, 707.0, 612.5, 184.5, 1226, 370)

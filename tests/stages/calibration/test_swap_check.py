@@ -26,6 +26,20 @@ def test_matches_fit_one_way_round(toe_in):
     assert fits(rig, right, left) < 0.45
 
 
+def test_matches_of_a_camera_that_was_knocked_fit_once_it_is_turned_back_and_those_of_another_time_do_not():
+    rng = np.random.default_rng(3)
+    T = RigidTransform(np.eye(3), np.array([-0.2, 0.0, 0.0]))
+    rig = Rig(CAMERA, CAMERA, T)
+    left = rng.uniform([0, 0], [640, 480], (1000, 2))
+    points = CAMERA.rays(left) * rng.uniform(1.2, 4.0, (1000, 1))
+    turn, ahead = RigidTransform(rotation_exp([0.01, 0.0, 0.02]), np.zeros(3)), np.array([0.0, 0.0, -0.3])
+    for pose, share in ((turn @ T, 0.9), (RigidTransform(np.eye(3), T.translation + ahead), 0.4)):
+        right = CAMERA.project(pose.apply(points)) + rng.normal(0, 0.3, (1000, 2))
+        right[::20] = rng.uniform(0, 400, (50, 2))
+        assert fits(rig, left, right) < 0.4
+        assert (fits(rig, left, right, turned=True) > share) == (share == 0.9)
+
+
 def seen(camera, T, texture):
     """Image of a textured wall, whose lower half is nearer, by a camera; T maps the left camera frame to its own."""
     v, u = np.indices((camera.height, camera.width), np.float64)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.imaging.image_quality import glance, image_quality_stage
+from rille.stages.imaging.image_quality import glance, image_quality_stage, noise_alone
 
 
-def picture(seed=1, shape=(200, 300)):
+def picture(seed=1, shape=(200, 300), blur=1.2):
     rng = np.random.default_rng(seed)
-    noise = cv2.GaussianBlur(rng.normal(0, 1, shape), (0, 0), 1.2)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, shape), (0, 0), blur)
     return np.clip(110 + 40 * noise / noise.std() + rng.normal(0, 1.5, shape), 0, 255).astype(np.uint8)
 
 
@@ -25,6 +25,26 @@ def test_blur_takes_sharpness_and_strong_blur_takes_detail():
     dark = glance((0.3 * image).astype(np.uint8), valid)  # exposure is no blur
     assert dark["sharpness"] > 0.8 * sharp["sharpness"]
     assert dark["detail"] > 0.8 * sharp["detail"]
+
+
+@pytest.mark.parametrize(("size", "along"), [((9, 1), "rows"), ((1, 9), "columns")])
+def test_motion_takes_the_sharpness_along_itself(size, along):
+    image = picture(blur=0.7)
+    sharp, moved = (glance(of, np.ones(of.shape, np.uint8)) for of in (image, cv2.blur(image, size)))
+    across = {"rows": "columns", "columns": "rows"}[along]
+    assert moved[f"sharpness_{along}"] < 0.65 * sharp[f"sharpness_{along}"]
+    assert moved[f"sharpness_{across}"] > 0.8 * sharp[f"sharpness_{across}"]
+    assert moved["sharpness"] > 0.6 * sharp["sharpness"]
+
+
+@pytest.mark.parametrize(("mean", "deviation"), [(3, 1.5), (60, 25), (128, 3)])
+def test_noise_alone_is_told_from_a_faint_photograph_with_noise(mean, deviation):
+    rng = np.random.default_rng(2)
+    noise, valid = rng.normal(mean, deviation, (200, 300)), np.ones((200, 300), np.uint8)
+    assert noise_alone(glance(np.clip(np.rint(noise), 0, 255).astype(np.uint8), valid))
+    faint = noise + deviation * (picture() / 40.0 - 2.75)  # landmarks as strong as the noise
+    assert not noise_alone(glance(np.clip(np.rint(faint), 0, 255).astype(np.uint8), valid))
+    assert not noise_alone(glance(np.zeros((200, 300), np.uint8), valid))
 
 
 def test_figures_of_a_known_image():

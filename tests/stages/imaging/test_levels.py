@@ -61,6 +61,19 @@ def test_one_scale_holds_for_dark_and_bright_images():
     assert spread(dark, levels).max() < spread(bright, levels).max() / 2
 
 
+def test_counts_that_drift_are_spread_around_the_middle_of_each_image():
+    """As those of a thermal camera that warms up, by more than the scene takes."""
+    images = [scene(7000 + 400 * k, 7250 + 400 * k, k) for k in range(3)]
+    levels = levels_of(images)
+    assert levels == (None, levels_of(images[:1])[1])
+    for image in images:
+        out = spread(image, levels).astype(int)
+        assert abs(np.median(out) - 32_768) <= levels[1]
+        assert np.ptp(out) > 0.2 * 65_535
+    assert "its image's median" in words((levels, levels))[0]
+    assert levels_of([scene(100, 400), scene(100, 3600, 4)])[0] is not None  # by day and by night
+
+
 @pytest.mark.parametrize("factor", [16, 6, 1.9, 1])
 def test_cameras_whose_drivers_shift_bits_unlike_are_spread_each(factor):
     dim, bright = scene(20, 3500), scene(20 * factor, 3500 * factor, 4)

@@ -10,13 +10,14 @@ from motion_scenes import motion, shift, tables
 from raising import raises
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.imaging.image_quality import ALONG
 from rille.stages.odometry.frame_screening import FrameScreeningParams, frame_screening_stage, judge
 
 PARAMS = FrameScreeningParams()
 
 
 def sight(k, **left):
-    good = {"mean": 100.0, "deviation": 40.0, "sharpness": 0.5, "detail": 0.1}
+    good = {"mean": 100.0, "deviation": 40.0, **dict.fromkeys(ALONG, 0.5), "detail": 0.1}
     return {"left": good | {"digest": f"L{k}"} | left, "right": good | {"digest": f"R{k}"}}
 
 
@@ -63,13 +64,27 @@ def test_a_black_frame_is_lost_whatever_matches_and_is_bridged():
     assert found({(2, 4): 0.6}, qualities).lost == {3: "left image 3.png is damaged"}
 
 
-def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it():
-    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, sharpness=0.2)}
+@pytest.mark.parametrize(("what", "words"), [("sharpness", ""), ("sharpness_rows", " along the rows")])
+def test_a_blurred_frame_is_posed_but_not_basic_unless_nothing_matches_it(what, words):
+    qualities = {k: sight(k) for k in range(7)} | {3: sight(3, **{what: 0.2})}
     out = found({}, qualities)
-    assert out.unfit == {3: "blurred left image (40% of the usual sharpness)"}
+    assert out.unfit == {3: f"blurred left image (40% of the usual sharpness{words})"}
     assert not out.lost
     alone = {(2, 3): 0.05, (3, 4): 0.05, (2, 4): 0.1}
     assert "blurred left image" in found(alone, qualities).lost[3]
+
+
+def test_frames_of_noise_alone_make_no_pairs_however_many_and_blur_none_of_the_others():
+    noise = {"mean": 3.0, "deviation": 1.5, "sharpness": 4.6, "detail": 0.19}
+    qualities = {k: sight(k) for k in range(7)}
+    for k in range(3, 7):  # more than half: a cap on the right lens
+        qualities[k]["right"] |= noise
+    out = found({}, qualities)
+    assert out.unfit == dict.fromkeys(range(3, 7), "right image of noise alone")
+    assert not out.lost
+    assert found({}, {k: sight(k, **(noise if k == 6 else {})) for k in range(7)}).lost == {
+        6: "left image of noise alone"
+    }
 
 
 def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
@@ -110,7 +125,7 @@ def test_exchanged_sides_are_looked_for_at_jumps_and_beside_each_other():
     assert asked == {"sides": [2, 4], "bridges": [(2, 4)]}
     out = found({(2, 4): 0.6}, jumps=[3], sides={2: looked, 3: swapped, 4: looked})
     assert list(out.lost) == [3]
-    assert "swapped (95%" in out.lost[3]
+    assert "swapped, or both upside down or mirrored (95%" in out.lost[3]
     assert not found({}, jumps=[3], sides={3: looked}).lost
 
 
@@ -124,6 +139,9 @@ def test_frames_whose_left_image_is_of_another_time_are_lost_beside_frames_that_
     assert not found({}, jumps=[3], sides=dict.fromkeys((2, 3, 4), apart)).lost
     half, least = apart | {"as_given": 0.59}, apart | {"as_given": 0.1}
     assert not found({}, jumps=[3], sides={2: half, 3: least, 4: half}).lost
+    # a mount that moved keeps its frame; on a straight lift images of two times look nearly like one
+    assert not found({}, jumps=[3], sides={2: fits, 3: apart | {"as_turned": 0.95}, 4: fits}).lost
+    assert list(found({(2, 4): 0.6}, jumps=[3], sides={2: fits, 3: apart | {"as_turned": 0.88}, 4: fits}).lost) == [3]
     # nor does one that fits somewhat less
     assert not found({}, jumps=[3], sides={2: fits, 3: fits | {"as_given": 0.6}, 4: fits}).lost
 
