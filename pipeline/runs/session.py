@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
@@ -31,7 +31,6 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
-from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
@@ -67,19 +66,6 @@ def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     given = read_toml(options.config, "configuration") if options.config else {}
     # --set overrides --config.
     return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
-
-
-Chosen = TypeVar("Chosen", bound=Settings)
-
-
-def resolved(sequence: str, options: Chosen) -> tuple[str, Chosen, rocrate.Crate | None]:
-    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew."""
-    crate = rocrate.read(Path(sequence))
-    if crate is None:
-        return sequence, options, None
-    own: dict[str, Any] = {"config": crate.folder / "config.toml", "frames": crate.options.get("--frames", (None,))[-1]}
-    own |= {name: crate.options.get(f"--{name}", ()) for name in ("until", "only") if hasattr(options, name)}
-    return crate.sequence, replace(options, **{n: getattr(options, n) or value for n, value in own.items()}), crate
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:
