@@ -48,7 +48,7 @@ from rille.stages.geometry.epipolar import (
     corrected,
     distances,
     image_turn,
-    standing_right,
+    standing,
     turn_axes,
 )
 from rille.stages.geometry.geometry import Rig
@@ -233,7 +233,7 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
     # The offset stands for the angle that causes it, which is not repeated.
-    if standing_right(rig):
+    if standing(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:
         lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"

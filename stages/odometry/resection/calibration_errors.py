@@ -113,7 +113,7 @@ def corrected_rig(
 
     Where a pitch moves all disparities, as of cameras one above the other, pitch and yaw change places.
     """
-    first = [yaw, pitch] if epipolar.standing_right(rig) else [pitch, yaw]
+    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
     turned = epipolar.corrected(rig, np.array([*first, *others]))
     left, right = (errors_of(side, rig, errors) for side in ("left", "right"))
     return replace(turned, left=corrected(rig.left, left), right=corrected(rig.right, right))

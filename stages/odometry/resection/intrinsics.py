@@ -303,7 +303,7 @@ def intrinsics_stage(
     """
     shown = shown_by(segments, params.sigma)
     used = Rig.from_dict(rig.meta["rig"])
-    focal, upright = used.left.fx, epipolar.standing_right(used)
+    focal, upright = used.left.fx, epipolar.standing(used)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     believed = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR

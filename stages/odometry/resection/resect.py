@@ -252,7 +252,7 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
     use, off, depth = segment.inlier[:, -1] != 0, [], []
-    side, axes = int(epipolar.standing_right(then)), epipolar.turn_axes(then)[:2, :2]
+    side, axes = int(epipolar.standing(then)), epipolar.turn_axes(then)[:2, :2]
     for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
         disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
         at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)

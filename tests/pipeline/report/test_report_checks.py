@@ -83,8 +83,8 @@ def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(s
 
 @pytest.mark.parametrize(("angle", "told"), [(0.0025, True), (0.0005, False), (0.0, False)])
 def test_a_toe_in_is_told_where_it_moves_disparities_at_the_sides(angle, told, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = Camera(707.0, 707.0, 612.5, 184.5, 1226, 370)
-    rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
+    left, right = (Camera(707.0 * n, 707.0 * n, 612.5 * n, 184.5 * n, 1226 * n, 370 * n) for n in (2, 1))
+    rig = Rig(left, right, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
     monkeypatch.setattr(summary, "facts_of", lambda *_: {"errors": {"toe-in": [angle, 0.0001]}})
     products = SimpleNamespace(intrinsics=None)
     lines = summary.wrong_toe_in(SimpleNamespace(products=products, sequence=SimpleNamespace(rig=rig)))
