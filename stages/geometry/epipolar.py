@@ -29,10 +29,6 @@ MAX_LINE_DISTANCE_PX = 2.0
 images, .22 to .32 of images one frame apart; in a desert .99, and up to .08."""
 
 
-MAX_OBLIQUE_DEG = 15.0
-"""Angle [degrees] of the baseline in the right image with its rows or columns up to which its own axes serve."""
-
-
 def turn_axes(rig: Rig) -> Floats:
     """Axes of pitch, yaw and roll in the right camera's frame, the columns of (3, 3).
 
@@ -41,7 +37,8 @@ def turn_axes(rig: Rig) -> Floats:
     """
     x, y, _ = rig.T_right_left.translation
     angle = math.remainder(math.atan2(y, x), math.pi)
-    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(MAX_OBLIQUE_DEG)
+    # 15 degrees to the image's rows or columns: up to there its own axes serve.
+    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(15.0)
     # 0.5: of the baseline. Where it leads along the view, lines radiate and show all turns.
     if not oblique or math.hypot(x, y) < 0.5 * rig.baseline:
         return np.eye(3)

@@ -187,10 +187,8 @@ class PlaneView:
 def rounded_cell(size: float) -> float:
     """The cell size of 1, 2 or 5 times a power of ten, m, that is nearest to ``size``."""
     first = math.floor(math.log10(size))
-    return min((m * 10.0**e for e in (first, first + 1) for m in _125), key=lambda step: abs(math.log(step / size)))
-
-
-_125 = (1.0, 2.0, 5.0)
+    steps = (m * 10.0**e for e in (first, first + 1) for m in (1.0, 2.0, 5.0))
+    return min(steps, key=lambda step: abs(math.log(step / size)))
 
 
 def view_points(samples: Samples, T_local_left: RigidTransform, slopes: Sequence[float] = (0.0, 0.0)) -> PlaneView:
