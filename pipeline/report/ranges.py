@@ -1,4 +1,4 @@
-"""Ranges of values in which a raster is shown: robust, so that few outliers do not take all the contrast."""
+"""Ranges of values, in numbers and in words: robust, so that few outliers do not take all the contrast of a raster."""
 
 from __future__ import annotations
 
@@ -42,3 +42,12 @@ def ground_limits(elevation: Image) -> tuple[float, float]:
     # Where more than half of the cells are equal the deviation is 0, and the range must not be.
     reach = max(5 * mad_sigma(finite), 1e-3 * (high - low))
     return max(low, middle - reach), min(high, middle + reach)
+
+
+def spread(values: Any) -> str:
+    """``low to high`` of nearly all values, for alternative texts."""
+    finite = sample(np.asarray(values))
+    if not finite.size:
+        return "nothing defined"
+    low, high = np.percentile(finite, [1, 99])
+    return f"{low:.3g} to {high:.3g}"

@@ -372,14 +372,7 @@ def rig_stage(
     lenses: Mapping[str, Any] | None = None,
 ) -> Bundle[RigFacts]:
     """The rig: the given calibration, repaired where the images contradict it."""
-    pairs = [
-        PointPairs(
-            found.meta["pair"],
-            np.asarray(found["left"], dtype=np.float64),
-            np.asarray(found["right"], dtype=np.float64),
-        )
-        for found in orientations
-    ]
+    pairs = [PointPairs.of(found) for found in orientations]
     shares = [found.meta["repeated"] for found in orientations]
     opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
     both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened
