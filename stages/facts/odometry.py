@@ -132,8 +132,6 @@ class TrajectoryFacts(Facts):
     pieces: list[list[int]]
     """Frames of each."""
     main: int
-    posed: int
-    in_world: int
     lost: list[dict[str, Any]]
     """Frame, cause, and the frames between which it is bridged."""
     breaks: list[dict[str, Any]]

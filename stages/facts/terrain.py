@@ -122,4 +122,3 @@ class MapFixFacts(Facts):
     """6 x 6."""
     fit: NotRequired[Json]
     """Figures of :class:`rille.stages.terrain.map_localization.Placement`, of elevations."""
-    ambiguous: NotRequired[bool]

@@ -117,7 +117,6 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "planner": route.planner,
         "ground": route.ground,
         "reason": route.reason if len(xyz) else _why(route.reason, maps, vehicle),
-        "blocking_row": row,
         "blocking_y": None if row is None else (lattice.j0 - row) * lattice.cell,
         "ended_by": route.ended_by,
     }

@@ -393,7 +393,6 @@ def map_localization_stage(
         "std": np.sqrt(np.diag(placed.covariance)).tolist(),
         "covariance": placed.covariance.tolist(),
         "fit": dict(placed.figures),
-        "ambiguous": bool(placed.doubt),
     }
     if placed.doubt:
         meta["warnings"] = [f"the first pose in the global map is ambiguous: {placed.doubt}"]

@@ -240,8 +240,6 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
         "verticals": list(verticals),
         "pieces": [[frames[k] for k in rows] for rows in members],
         "main": main,
-        "posed": len(posed),
-        "in_world": int((piece == main).sum()),
         "lost": lost,
         "breaks": [{"frame": k, "cause": causes[k]} for k in (frames[rows[0]] for rows in members[1:]) if k in causes],
     }

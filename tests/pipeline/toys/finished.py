@@ -88,7 +88,6 @@ def bundles() -> dict[str, Bundle]:
     path_meta = {
         "found": True,
         "reason": "",
-        "blocking_row": None,
         "blocking_y": None,
         "length_m": 0.49,
         "climb_m": 0.004,
