@@ -47,7 +47,6 @@ class KeyframesFacts(Facts):
 
     basic: list[int]
     segments: list[list[int]]
-    rule: str
     overlap: list[float | None]
     why: list[str]
     displacement: list[float | None]

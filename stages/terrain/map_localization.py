@@ -391,7 +391,6 @@ def map_localization_stage(
         "T_global_local": placed.pose.to_list(),
         "source": "aligned to the global map",
         "std": np.sqrt(np.diag(placed.covariance)).tolist(),
-        "covariance": placed.covariance.tolist(),
         "fit": dict(placed.figures),
     }
     if placed.doubt:

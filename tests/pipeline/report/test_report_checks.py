@@ -125,7 +125,7 @@ def test_overlapping_models_and_the_choice_of_pairs_are_tabled(self_checked: Wri
 def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:
     made = bundles() | checks()
     rig, agreement = made["rig"].meta, made["agreement"]
-    made["rig"] = Bundle({}, {"rig": rig["rig"], "mode": "fixed", "baseline": 0.097, "source": "given calibration"})
+    made["rig"] = Bundle({}, {"rig": rig["rig"], "source": "given calibration"})
     made["keyframes"] = Bundle({}, {"basic": list(BASIC)})
     made["agreement"] = Bundle(agreement.arrays, {})
     del made["crosscheck_accuracy"], made["orientation4"]

@@ -171,7 +171,6 @@ def checks() -> dict[str, Bundle]:
         "rig": REPAIRED.to_dict(),
         "given": RIG.to_dict(),
         "changed": True,
-        "mode": "pooled",
         "source": "given calibration, pitch repaired from 2 pairs",
         "parameters": [parameter | freed, parameter | held],
         "per_pair": [
@@ -207,7 +206,6 @@ def checks() -> dict[str, Bundle]:
         "basic": list(BASIC),
         "overlap": [None, 0.72],
         "why": ["first frame", "overlap"],
-        "rule": "overlap 0.7",
         "displacement": [3.0, 3.5, None, 4.0, 4.5],
         "warnings": [],
     }
