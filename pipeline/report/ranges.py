@@ -6,14 +6,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.declare import AnyArray
 from rille.stages.numeric.robust import mad_sigma
 
-Image = NDArray[Any]
 
-
-def sample(values: Image) -> Image:
+def sample(values: AnyArray) -> AnyArray:
     """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
     step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
     part = values[::step, ::step] if step > 1 else values
@@ -22,7 +20,7 @@ def sample(values: Image) -> Image:
     return finite if finite.size >= 100 or step == 1 else values[np.isfinite(values)]
 
 
-def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
+def limits(values: AnyArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
     """Robust range of the finite values: percentiles, never empty."""
     finite = sample(values)
     if finite.size == 0:
@@ -32,7 +30,7 @@ def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, 
     return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
 
 
-def ground_limits(elevation: Image) -> tuple[float, float]:
+def ground_limits(elevation: AnyArray) -> tuple[float, float]:
     """Range of elevations that shows the ground where crowns and walls rise above it: five robust deviations."""
     finite = sample(elevation)
     low, high = limits(elevation)
