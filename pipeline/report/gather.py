@@ -31,12 +31,9 @@ class WorldTerrain:
 
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
-        values, sampled = self.arrays.get(name), np.full(len(xy), np.nan)
-        if values is not None:
-            row, col = np.rint(self.lattice.index(xy)).astype(int).T
-            inside = (row >= 0) & (col >= 0) & (row < values.shape[0]) & (col < values.shape[1])
-            sampled[inside] = values[row[inside], col[inside]]
-        return sampled
+        if name not in self.arrays:
+            return np.full(len(xy), np.nan)
+        return self.lattice.values(self.arrays[name], self.lattice.index(xy), np.nan)
 
 
 @dataclass(frozen=True)

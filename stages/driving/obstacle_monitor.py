@@ -73,11 +73,7 @@ class LastModel:
 
     def top_at(self, xy: Floats) -> Floats:
         """Greatest height near points (n, 2); -inf if no cell nearby is known, NaN outside."""
-        at = np.rint(self.lattice.index(np.nan_to_num(xy))).astype(np.int64)
-        inside = ((at >= 0) & (at < self.lattice.shape)).all(axis=1) & np.isfinite(xy).all(axis=1)
-        out = np.full(len(xy), np.nan)
-        out[inside] = self.top[at[inside, 0], at[inside, 1]]
-        return out
+        return self.lattice.values(self.top, self.lattice.index(xy), np.nan)
 
 
 @dataclass(frozen=True)
