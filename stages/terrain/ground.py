@@ -231,7 +231,7 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Plane
     rho = rays @ (np.array([-a, -b, 1.0]) @ R_local_left) / c
     with np.errstate(divide="ignore", invalid="ignore"):
         right = rig.right.project(rig.T_right_left.apply(rays / rho[:, None]))
-        in_both = (rho > 0) & ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
+        in_both = (rho > 0) & rig.right.holds(right)
     if not in_both.any():
         raise DegenerateError(
             "RIL-345",
