@@ -51,9 +51,6 @@ IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 STAMP = re.compile(r"\d{16,}")
 """Time of EuRoC, nanoseconds; programs that write seconds have other orders of columns."""
 
-MIN_ROUNDED = 4
-"""Fewest rows whose coordinates show their precision."""
-
 WITHIN = 1e-6
 """s; times that differ by less are equal."""
 
@@ -260,7 +257,7 @@ def _rounded(places: Floats, name: str) -> tuple[str, ...]:
     rounded = (places == single).all(axis=0) & stepwise & (np.ptp(places, axis=0) > 0)
     step = float(np.spacing(np.abs(single).max(axis=0))[rounded].max(initial=0.0))
     # Few rows may be such numbers by chance.
-    if step < 0.01 or len(places) < MIN_ROUNDED:
+    if step < 0.01 or len(places) < 4:
         return ()
     line = f"{name}: its coordinates have steps of {step:g} m, as numbers of single precision have so far from 0"
     return (warning("RIL-709", f"{line}: write them in double precision, or less a constant"),)

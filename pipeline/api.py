@@ -20,7 +20,7 @@ from rille.datasets.text.reading import TABLE, read_lines, read_text
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.runs import lookup
-from rille.pipeline.steps import StereoSequence, assignments, place_of
+from rille.pipeline.steps import Settings, StereoSequence, assignments, place_of
 from rille.stages.core.errors import InputError, RilleError
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "z")
 T = TypeVar("T")
-Settings = Mapping[str, Any]
 
 
 def reconstruct(

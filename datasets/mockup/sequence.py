@@ -32,9 +32,6 @@ FIRST_Y_M = -0.1
 
 TRUTH_SOURCE = "the simulator's own poses: exact"
 
-EVALUATION_WINDOW_M = (-0.3, 0.4, 0.3, 0.7)
-"""m, evaluation window of a basic pair: 600 x 300 mm about where the optical axes cross (0.55 m ahead)."""
-
 LOOP: Mapping[str, Any] = {
     "image_width": 320,
     "image_height": 240,
@@ -211,7 +208,8 @@ def mockup(p: MockupParams, name: str = "mockup") -> Sequence:
         vehicle=vehicle_at_scale(),
         truth_dem=dem,
         truth_disparity=lambda frame: sources.disparity(frame, lefts[frame]),
-        evaluation_window=EVALUATION_WINDOW_M,
+        # 600 x 300 mm about where the optical axes cross, 0.55 m ahead.
+        evaluation_window=(-0.3, 0.4, 0.3, 0.7),
         defaults={
             "keyframes.rule": "stride",
             "keyframes.stride": 4,

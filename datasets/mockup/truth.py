@@ -32,8 +32,7 @@ def visible(
     """
     camera_points = transform(T_bed_camera.inverse(), points)
     pixels = camera.project(camera_points)
-    with np.errstate(invalid="ignore"):
-        inside = np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1))
+    inside = camera.holds(pixels)
     free = np.zeros(len(points), dtype=bool)
     directions = points[inside] - T_bed_camera.translation
     t = field.contact(T_bed_camera.translation[None, :], directions)

@@ -217,10 +217,6 @@ class Graph:
         inputs = {name: args.pop(name) for name in stage.ports() if name in args}
         return self.node(stage, label, params, args, inputs=inputs)
 
-    def asks_for(self, stage: str) -> bool:
-        """Whether tasks of a stage are wanted for themselves."""
-        return self.cut is None or stage in self.cut.stages
-
     def flow(self, steps: Generator[Wait, Any, None]) -> None:
         """Run a generator on the client until it waits, and go on once the results that it waits for are there.
 

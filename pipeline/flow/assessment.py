@@ -64,8 +64,8 @@ def of_pair(make: Builder, pair: Pair) -> Flow:
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )
-    exact, T_truth_left = make.sequence.truth_dem, _truth(make, pair.frame)
-    if exact is None or T_truth_left is None or not make.graph.asks_for("dem_accuracy"):
+    exact, T_truth_left, cut = make.sequence.truth_dem, _truth(make, pair.frame), make.graph.cut
+    if exact is None or T_truth_left is None or (cut and "dem_accuracy" not in cut.stages):
         return
     level, dem = (yield from done(pair.level)), (yield from done(pair.dem))
     source = exact(dem.meta["lattice"], _levelled(T_truth_left, level), (pair.frame,))

@@ -34,7 +34,7 @@ from rille.stages.imaging.pyramid import pyramid_stage
 from rille.stages.imaging.undistort import undistort_stage
 from rille.stages.odometry.motion import motion_stage
 from rille.stages.odometry.pose import pose_stage
-from rille.stages.odometry.resection.calibration_errors import calibrated_anew, corrected, errors_of
+from rille.stages.odometry.resection.calibration_errors import calibrated_anew, corrected_like
 from rille.stages.odometry.resection.resect import resect_stage
 from rille.stages.odometry.track import track_stage
 from rille.stages.terrain.ground_frame import SCENE, ground_frame_stage
@@ -99,9 +99,7 @@ def name_graph(graph: Graph, sequence: Sequence, frames: Series[int]) -> None:
 def recalibrated(sequence: Sequence, correction: Series[float]) -> Sequence:
     """The sequence with its cameras and its rig's yaw corrected as stage ``intrinsics`` says."""
     rig, lenses = sequence.rig, (sequence.lenses or {}).items()
-    anew = {
-        side: replace(lens, camera=corrected(lens.camera, errors_of(side, rig, correction))) for side, lens in lenses
-    }
+    anew = {side: replace(lens, camera=corrected_like(side, lens.camera, rig, correction)) for side, lens in lenses}
     return replace(sequence, rig=calibrated_anew(rig, correction), lenses=anew or None)
 
 

@@ -94,9 +94,6 @@ MAX_CALIBRATIONS = 6
 """Corrections of the calibration: one to three are usual for a focal length that is 10 % off, two for a yaw that is
 half a degree off."""
 
-MAX_KNOCKS = 4
-"""Knocks of a rig that are followed; behind further ones no frame has a pose."""
-
 
 def reconstruction(make: Builder, frames: tuple[int, ...]) -> Flow:
     """Lay out the reconstruction of the chosen frames, in order.
@@ -209,7 +206,8 @@ def tracked(
         key = matched[choice.basic[0]]
         judged = sound and make.config.resect.joint
         correction = (yield from corrected_calibration(make, key, [s.resection for s in sound])) if judged else None
-        first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(knocks) < MAX_KNOCKS
+        # Behind more than four knocks no frame has a pose.
+        first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(knocks) < 4
         if correction is None and followed and first is not None and first not in knocks:
             knocks[first] = moved[first]
             make.discard(since)

@@ -16,12 +16,7 @@ from rille.pipeline.engine.graph import Complete, Handle, Wait, done
 from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow.builders import Builder, Segment
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts, SynchronyFacts
-from rille.stages.facts.odometry import (
-    KeyframesFacts,
-    ResectFacts,
-    ScreeningFacts,
-    StepTableFacts,
-)
+from rille.stages.facts.odometry import KeyframesFacts, ResectFacts, ScreeningFacts, StepTableFacts
 from rille.stages.odometry.frame_screening import frame_screening_stage
 from rille.stages.odometry.keyframes import keyframes_stage
 from rille.stages.odometry.steps import step_table_stage

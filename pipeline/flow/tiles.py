@@ -27,9 +27,6 @@ putting together (one array at a time, 12 bytes), the features of the other imag
 as without texture (8 bytes), and planes of textureless regions (6 bytes, 18 more if these are large).
 """
 
-SIDE_STEP, MIN_SIDE = 128, 256
-"""Pixels: a chosen side is a multiple of the first, and at least the second: below, surroundings outweigh the tile."""
-
 
 class Tiling(Params):
     """When a pair is matched in tiles; 99.9 % of the pixels are within .01 px of the untiled result.
@@ -57,7 +54,8 @@ def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tup
         if max(s[0] * s[1] for s in shapes) * WHOLE_BYTES <= tiling.memory * 1e6:
             return None
         most = int((tiling.memory * 1e6 / TILE_BYTES) ** 0.5)
-        chosen = max(most // SIDE_STEP * SIDE_STEP, MIN_SIDE)
+        # Below 256 pixels surroundings outweigh the tile.
+        chosen = max(most // 128 * 128, 256)
     return chosen if chosen < max(*shapes[0], *shapes[1]) else None
 
 

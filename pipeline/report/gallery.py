@@ -14,7 +14,7 @@ from rille.pipeline.report import canvas, figures, gather, ranges, strips, table
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.words import spread
+from rille.pipeline.report.ranges import spread
 from rille.stages.core.errors import RilleError
 
 Maker = Callable[[Scene], Block | None]

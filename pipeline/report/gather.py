@@ -31,12 +31,9 @@ class WorldTerrain:
 
     def at(self, name: str, xy: Floats) -> Floats:
         """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
-        values, sampled = self.arrays.get(name), np.full(len(xy), np.nan)
-        if values is not None:
-            row, col = np.rint(self.lattice.index(xy)).astype(int).T
-            inside = (row >= 0) & (col >= 0) & (row < values.shape[0]) & (col < values.shape[1])
-            sampled[inside] = values[row[inside], col[inside]]
-        return sampled
+        if name not in self.arrays:
+            return np.full(len(xy), np.nan)
+        return self.lattice.values(self.arrays[name], self.lattice.index(xy), np.nan)
 
 
 @dataclass(frozen=True)
@@ -122,8 +119,26 @@ class Scene:
 
     @cached_property
     def track(self) -> Track:
-        """The trajectory."""
-        return trajectory(self.view)
+        """Positions of all chosen frames, estimated and true."""
+        view, p = self.view, self.view.products
+        bundle, assessed, n = view.bundle(p.trajectory), view.bundle(p.accuracy), len(view.frames)
+        nowhere, nothing = np.full((n, 3), np.nan), np.full(n, -1)
+        if bundle is None:
+            return Track(nowhere, None, nowhere[:, 0], nothing, nothing)
+        poses = rigid.by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
+        there = rigid.posed(poses)
+        variances = np.trace(by_frame(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
+        numbers = (by_frame(view, bundle, name) for name in ("segment", "piece"))
+        segment, piece = (np.nan_to_num(one, nan=-1).astype(int) for one in numbers)
+        # As ``accuracy`` brought it to the world.
+        truth = nowhere if assessed is None else by_frame(view, assessed, "position_truth")
+        return Track(
+            np.where(there[:, None], poses[:, :, 3], np.nan),
+            truth if np.isfinite(truth).any() else None,
+            np.where(there, np.sqrt(np.maximum(variances, 0)), np.nan),
+            np.where(there, segment, -1),
+            piece,
+        )
 
     @cached_property
     def comparison(self) -> CrosscheckComparison | None:
@@ -159,52 +174,11 @@ def terrain(bundle: Bundle | None, *names: str) -> WorldTerrain | None:
     return WorldTerrain(Lattice.from_dict(bundle.meta["lattice"]), arrays)
 
 
-def trajectory(view: RunView) -> Track:
-    """Positions of all chosen frames, estimated and true."""
-    bundle, n = view.bundle(view.products.trajectory), len(view.frames)
-    nowhere, nothing = np.full((n, 3), np.nan), np.full(n, -1)
-    if bundle is None:
-        return Track(nowhere, None, nowhere[:, 0], nothing, nothing)
-    poses = rigid.by_frame(world_poses(bundle), list(bundle.meta["frames"]), list(view.frames))
-    there = rigid.posed(poses)
-    variances = np.trace(by_frame(view, bundle, "covariance")[:, :3, :3], axis1=1, axis2=2)
-    segment, piece = (np.nan_to_num(by_frame(view, bundle, name), nan=-1).astype(int) for name in ("segment", "piece"))
-    return Track(
-        np.where(there[:, None], poses[:, :, 3], np.nan),
-        _truth_in_world(view),
-        np.where(there, np.sqrt(np.maximum(variances, 0)), np.nan),
-        np.where(there, segment, -1),
-        piece,
-    )
-
-
-def _truth_in_world(view: RunView) -> Floats | None:
-    """True positions (frame, 3) of the left camera in the world, NaN in gaps, as ``accuracy`` brought them there.
-
-    None where no frame has a pose and truth.
-    """
-    assessed = view.bundle(view.products.accuracy)
-    truth = np.full((1, 3), np.nan) if assessed is None else by_frame(view, assessed, "position_truth")
-    return truth if np.isfinite(truth).any() else None
-
-
 def stops(view: RunView) -> list[Stop]:
     """The stops of a drive that have a leg and a map; empty where nothing was driven."""
     drive = view.products.drive
     listed = [] if drive is None else drive.stops
     return [stop for stop in listed if view.bundle(stop.leg) is not None and view.bundle(stop.risk) is not None]
-
-
-def frame_facts(view: RunView) -> dict[int, dict[str, Any]]:
-    """Facts of the resection of each frame; a key frame's come from the segment that posed it, the one before.
-
-    Inliers and error are those of the joint adjustment, where there was one.
-    """
-    facts: dict[int, dict[str, Any]] = {}
-    for handle in view.products.resections:
-        for item in facts_of(view, handle).get("per_frame", ()):
-            facts.setdefault(int(item["frame"]), dict(item))
-    return facts
 
 
 def facts_of(view: RunView, handle: Any) -> Mapping[str, Any]:

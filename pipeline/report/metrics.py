@@ -10,11 +10,11 @@ import numpy as np
 
 from rille.pipeline.export.view import RunView
 from rille.pipeline.report import delivery, tables
+from rille.pipeline.report.delivery import Rows
 from rille.pipeline.report.gather import Scene, facts_of
 from rille.stages.evaluation.reading.hand_eye import WITHOUT
 
 Metric = dict[str, Any]
-Rows = list[dict[str, Any]]
 
 LABELS = {
     "drift": "Drift at the end",

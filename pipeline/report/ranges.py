@@ -1,4 +1,4 @@
-"""Ranges of values in which a raster is shown: robust, so that few outliers do not take all the contrast."""
+"""Ranges of values, in numbers and in words: robust, so that few outliers do not take all the contrast of a raster."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rille.stages.core.declare import AnyArray
 from rille.stages.numeric.robust import mad_sigma
 
-Image = NDArray[Any]
 
-
-def sample(values: Image) -> Image:
+def sample(values: AnyArray) -> AnyArray:
     """Finite values, about fifty thousand of them, evenly spread: enough for a percentile."""
     step = max(1, math.isqrt(values.size // 50_000)) if values.ndim == 2 else 1
     part = values[::step, ::step] if step > 1 else values
@@ -22,7 +20,7 @@ def sample(values: Image) -> Image:
     return finite if finite.size >= 100 or step == 1 else values[np.isfinite(values)]
 
 
-def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
+def limits(values: AnyArray, low: float = 2.0, high: float = 98.0) -> tuple[float, float]:
     """Robust range of the finite values: percentiles, never empty."""
     finite = sample(values)
     if finite.size == 0:
@@ -32,7 +30,7 @@ def limits(values: Image, low: float = 2.0, high: float = 98.0) -> tuple[float, 
     return (a, b) if b - a > pad else (a - 10 * pad, b + 10 * pad)
 
 
-def ground_limits(elevation: Image) -> tuple[float, float]:
+def ground_limits(elevation: AnyArray) -> tuple[float, float]:
     """Range of elevations that shows the ground where crowns and walls rise above it: five robust deviations."""
     finite = sample(elevation)
     low, high = limits(elevation)
@@ -42,3 +40,12 @@ def ground_limits(elevation: Image) -> tuple[float, float]:
     # Where more than half of the cells are equal the deviation is 0, and the range must not be.
     reach = max(5 * mad_sigma(finite), 1e-3 * (high - low))
     return max(low, middle - reach), min(high, middle + reach)
+
+
+def spread(values: Any) -> str:
+    """``low to high`` of nearly all values, for alternative texts."""
+    finite = sample(np.asarray(values))
+    if not finite.size:
+        return "nothing defined"
+    low, high = np.percentile(finite, [1, 99])
+    return f"{low:.3g} to {high:.3g}"

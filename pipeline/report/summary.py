@@ -304,7 +304,8 @@ def wrong_toe_in(view: RunView) -> list[str]:
     """A line on a toe-in that poses are corrected for and elevations are not, if it is known and more than little."""
     facts, rig = facts_of(view, view.products.intrinsics), view.sequence.rig
     angle, sigma = facts.get("errors", {}).get("toe-in", (0.0, 1.0))
-    span, focal = (rig.left.height, rig.left.fy) if standing(rig) else (rig.left.width, rig.left.fx)
+    right = rig.right
+    span, focal = (right.height, right.fy) if standing(rig) else (right.width, right.fx)
     off = abs(angle) * focal * (0.5 * span / focal) ** 2
     if abs(angle) < 5.0 * sigma or off < MIN_YAW_PX:
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,11 @@ Row = dict[str, Any]
 def frames(scene: gather.Scene) -> list[Row]:
     """One row a chosen frame: how its pose was found, how well, and how far it is from the truth."""
     view, track = scene.view, scene.track
-    facts = gather.frame_facts(view)
+    # Of a key frame those of the segment that posed it, the one before, come first.
+    facts = dict[int, Mapping[str, Any]]()
+    for handle in view.products.resections:
+        for item in facts_of(view, handle).get("per_frame", ()):
+            facts.setdefault(int(item["frame"]), item)
     names, compared = view.sequence.frame_names, scene.comparison
     rows = []
     for i, frame in enumerate(view.frames):

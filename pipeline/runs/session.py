@@ -14,12 +14,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
-from rille.datasets.registry import is_there, open_sequence
-from rille.datasets.text.names import shell_word
+from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
@@ -32,7 +31,6 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.workers import Workers, check
-from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
@@ -42,7 +40,7 @@ from rille.pipeline.runs import part_of_run, roots, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
-from rille.stages.core.errors import ConfigError, InputError, RilleError, warning, within
+from rille.stages.core.errors import ConfigError, RilleError, warning, within
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -68,30 +66,6 @@ def configured(options: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
     given = read_toml(options.config, "configuration") if options.config else {}
     # --set overrides --config.
     return configuration.split_dataset(configuration.merge(given, configuration.parse_assignments(options.assignments)))
-
-
-Chosen = TypeVar("Chosen", bound=Settings)
-
-
-def resolved(sequence: str, options: Chosen) -> tuple[str, Chosen, rocrate.Crate | None]:
-    """Sequence and options of a command; where a crate is named its own, as far as they are not given anew.
-
-    Raises
-    ------
-    InputError
-        The crate's sequence is not where its command says.
-    """
-    crate = rocrate.read(Path(sequence))
-    if crate is None:
-        return sequence, options, None
-    if not is_there(crate.sequence):
-        text = f"{sequence} is a run of {crate.sequence}, which is not here, and a crate holds no images"
-        whence = f"name the crate {shell_word(crate.folder.resolve())} in a folder where it lies"
-        whence = "bring it, or a link to it, to this path" if Path(crate.sequence).is_absolute() else whence
-        raise InputError("RIL-612", text, remedy=f"{whence}; {rocrate.METADATA} has the SHA-256 of each image")
-    own: dict[str, Any] = {"config": crate.folder / "config.toml", "frames": crate.options.get("--frames", (None,))[-1]}
-    own |= {name: crate.options.get(f"--{name}", ()) for name in ("until", "only") if hasattr(options, name)}
-    return crate.sequence, replace(options, **{n: getattr(options, n) or value for n, value in own.items()}), crate
 
 
 def settings(sequence: str | Sequence, options: Settings) -> Settled:

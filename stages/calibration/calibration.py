@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts
-from rille.stages.geometry.geometry import Rig
 
 
 @stage("calibration")
 def calibration_stage(params: NoParams, rig: Bundle[RigFacts]) -> Bundle[CalibrationFacts]:
     """The rig that is computed with."""
-    used = Rig.from_dict(rig.meta["rig"])
-    return Bundle({}, {"rig": used.to_dict(), "baseline": used.baseline, "changed": rig.meta["changed"]})
+    return Bundle({}, {"rig": rig.meta["rig"], "changed": rig.meta["changed"]})

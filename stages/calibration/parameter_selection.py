@@ -186,15 +186,20 @@ class _Chooser:
             if sorted(chosen) == before:
                 break
         fit, correction = self._settled(chosen)
-        sure = [i for i in chosen if abs(correction[i]) >= LEAST_SIGMAS * self._sigma(i, chosen, fit)]
-        if sure != chosen:
-            chosen = sure
-            fit, correction = self._settled(chosen)
-        if chosen and not self._worth(correction):  # changes that are large enough singly may cancel each other
-            chosen = []
-            fit, correction = self._settled(chosen)
+        for remaining in (self._sure, self._enough):
+            if (fewer := remaining(chosen, fit, correction)) != chosen:
+                chosen = fewer
+                fit, correction = self._settled(chosen)
         parameters = tuple(self._parameter(i, chosen, fit) for i in range(RIG))
         return Decision(correction, parameters, fit)
+
+    def _sure(self, chosen: list[int], fit: OrientationFit, correction: Floats) -> list[int]:
+        """Those of the chosen parameters whose correction exceeds its error."""
+        return [i for i in chosen if abs(correction[i]) >= LEAST_SIGMAS * self._sigma(i, chosen, fit)]
+
+    def _enough(self, chosen: list[int], fit: OrientationFit, correction: Floats) -> list[int]:
+        """The chosen parameters if they are worth it together: changes that are large singly may cancel each other."""
+        return chosen if self._worth(correction) else []
 
     def _sigma(self, i: int, chosen: Sequence[int], fit: OrientationFit) -> float:
         """Standard deviation of a chosen parameter, radians, with that of what is held."""

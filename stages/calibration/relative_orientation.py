@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Floats
+from rille.stages.core.declare import Bundle
 from rille.stages.geometry.epipolar import NAMES, distances, turn_axes
 from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
@@ -54,6 +55,12 @@ class PointPairs:
     pair: int
     left: Floats
     right: Floats
+
+    @staticmethod
+    def of(orientation: Bundle) -> PointPairs:
+        """Those of a result of stage ``orientation``."""
+        left, right = (np.asarray(orientation[side], dtype=np.float64) for side in ("left", "right"))
+        return PointPairs(orientation.meta["pair"], left, right)
 
 
 @dataclass(frozen=True)

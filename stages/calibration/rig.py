@@ -48,7 +48,7 @@ from rille.stages.geometry.epipolar import (
     corrected,
     distances,
     image_turn,
-    standing_right,
+    standing,
     turn_axes,
 )
 from rille.stages.geometry.geometry import Rig
@@ -95,8 +95,6 @@ def orient_rig(
     facts: RigFacts = {
         "rig": given.to_dict(),
         "given": (first or given).to_dict(),
-        "mode": params.mode,
-        "baseline": given.baseline,
         "source": "given calibration",
         "changed": False,
         "warnings": [],
@@ -179,7 +177,6 @@ def _judged(given: Rig, pairs: list[PointPairs], params: RigParams, shown: str, 
         "changed": applied,
         "parameters": [p.to_dict() for p in decision.parameters],
         "per_pair": per_pair,
-        "pairs": len(pairs),
         "matches": sum(len(m.left) for m in pairs),
         "residual_before_px": before,
         "residual_after_px": after,
@@ -237,7 +234,7 @@ def _source(decision: Decision, applied: bool, pairs: int) -> str:
 def _misalignment(rig: Rig, offset: float, decision: Decision) -> str:
     """How the right image departs from the given rig, in words: offset across lines (pixels) and freed parameters."""
     # The offset stands for the angle that causes it, which is not repeated.
-    if standing_right(rig):
+    if standing(rig):
         lines, where, told = "columns", "far right" if offset > 0 else "far left", "yaw"
     else:
         lines, where, told = "rows", "low" if offset > 0 else "high", "pitch"
@@ -376,14 +373,7 @@ def rig_stage(
     lenses: Mapping[str, Any] | None = None,
 ) -> Bundle[RigFacts]:
     """The rig: the given calibration, repaired where the images contradict it."""
-    pairs = [
-        PointPairs(
-            found.meta["pair"],
-            np.asarray(found["left"], dtype=np.float64),
-            np.asarray(found["right"], dtype=np.float64),
-        )
-        for found in orientations
-    ]
+    pairs = [PointPairs.of(found) for found in orientations]
     shares = [found.meta["repeated"] for found in orientations]
     opened = {side: Lens.from_dict(lens) for side, lens in (lenses or {}).items()}
     both = {"left": Lens(rig.left), "right": Lens(rig.right)} | opened

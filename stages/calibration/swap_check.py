@@ -13,7 +13,7 @@ from rille.stages.imaging.features import matched_points
 def swap_check_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: int, rig: Rig) -> Bundle[SwapFacts]:
     """Whether left and right of a pair are exchanged, by their features."""
     a, b = matched_points(left, right)
-    facts: SwapFacts = {"frame": frame, "matches": len(a), "swapped": False}
+    facts: SwapFacts = {"frame": frame, "swapped": False}
     if len(a) >= 50:
         facts["swapped"], facts["as_given"], facts["exchanged"] = exchanged(rig, a, b)
         facts["as_turned"] = fits(rig, a, b, turned=True)

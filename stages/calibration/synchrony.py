@@ -14,7 +14,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
-from rille.stages.geometry.epipolar import distances, standing
+from rille.stages.geometry.epipolar import distances, standing, turn_axes
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
@@ -35,7 +35,7 @@ def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
     near = np.abs(apart) < 0.1 * rig.right.height
     if near.sum() < 40:
         return None
-    apart, across = apart[near], at[near, 0 if standing(rig) else 1]
+    apart, across = apart[near], (other @ turn_axes(rig)[:2, 0 if standing(rig) else 1])[near]
     apart, across = apart - np.median(apart), across - np.median(across)
     far = np.abs(across) >= max(1.0, float(np.median(np.abs(across))))
     trend = np.median(apart[far] / across[far]) if far.any() else 0.0

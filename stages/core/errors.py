@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Self
 
 
@@ -27,7 +28,7 @@ class RilleError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # An exception is pickled by its args, to come back from a worker; keyword arguments would be lost.
-        return (_rebuild, (type(self), self.code, self.message, self.remedy))
+        return (partial(type(self), remedy=self.remedy), (self.code, self.message))
 
     def at(self, where: str) -> Self:
         """Return the same error with the place in front: ``where: message``."""
@@ -50,10 +51,6 @@ def did_you_mean(text: str, names: Iterable[str], prefix: str = "") -> str:
     known = list(dict.fromkeys(names))
     alike = difflib.get_close_matches(text, known, n=3, cutoff=0.6) or [n for n in known if text and text in n][:3]
     return f"did you mean {' or '.join(prefix + name for name in alike)}?" if alike else ""
-
-
-def _rebuild(kind: type[RilleError], code: str, message: str, remedy: str) -> RilleError:
-    return kind(code, message, remedy=remedy)
 
 
 class ConfigError(RilleError, ValueError):

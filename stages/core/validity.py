@@ -67,8 +67,3 @@ def matched_share(validity: Mask) -> float:
 def has(validity: Mask, bits: Validity) -> NDArray[np.bool_]:
     """Pixels with any of the bits."""
     return np.asarray((validity & np.uint8(bits)) != 0)
-
-
-def counts(validity: Mask) -> dict[str, int]:
-    """Number of pixels with each bit, by its name in lower case."""
-    return {str(bit.name).lower(): int(np.count_nonzero(has(validity, bit))) for bit in Validity}

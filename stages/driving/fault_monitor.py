@@ -138,5 +138,4 @@ def fault_monitor_stage(
         T_vehicle_left,
         vehicle,
     )
-    frame = None if verdict.stop is None else int(resect.meta["per_frame"][verdict.stop]["frame"])
-    return Bundle({}, {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason, "frame": frame})
+    return Bundle({}, {"stop": verdict.stop, "kind": verdict.kind, "reason": verdict.reason})

@@ -73,11 +73,7 @@ class LastModel:
 
     def top_at(self, xy: Floats) -> Floats:
         """Greatest height near points (n, 2); -inf if no cell nearby is known, NaN outside."""
-        at = np.rint(self.lattice.index(np.nan_to_num(xy))).astype(np.int64)
-        inside = ((at >= 0) & (at < self.lattice.shape)).all(axis=1) & np.isfinite(xy).all(axis=1)
-        out = np.full(len(xy), np.nan)
-        out[inside] = self.top[at[inside, 0], at[inside, 1]]
-        return out
+        return self.lattice.values(self.top, self.lattice.index(xy), np.nan)
 
 
 @dataclass(frozen=True)
@@ -217,9 +213,8 @@ def obstacle_monitor_stage(
     surface = LastModel.of(np.asarray(inputs.dem["elevation"]), lattice, 0.5 * wheel)
     poses = np.asarray(inputs.resect["poses"])  # NaN where tracking was lost, which stage fault_monitor judges
     known = posed(poses)
-    frames = [int(f["frame"]) for f in inputs.resect.meta["per_frame"]]
-    raised = np.zeros(len(frames), np.int32)
-    where = np.full((len(frames), 2), np.nan)
+    raised = np.zeros(len(poses), np.int32)
+    where = np.full((len(poses), 2), np.nan)
     stop, reason = None, ""
     for (i, j), motion in zip(pairs, inputs.motions, strict=True):
         if not (known[i] and known[j]):
@@ -237,13 +232,7 @@ def obstacle_monitor_stage(
             away = 1000.0 * (group.place[1] - 0.5 * vehicle.wheel_base - 0.5 * wheel)
             stop = j
             reason = f"obstacle {away:.0f} mm before the wheels: {group.count} points rise above the model"
-    meta: StopFacts = {
-        "stop": stop,
-        "frame": None if stop is None else frames[stop],
-        "reason": reason,
-        "frames": frames,
-    }
-    return Bundle({"raised": raised, "where": where}, meta)
+    return Bundle({"raised": raised, "where": where}, {"stop": stop, "reason": reason})
 
 
 def pairs(odometry: Floats, wheel: float) -> list[tuple[int, int]]:

@@ -15,9 +15,8 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
-from rille.stages.evaluation.coverage import within
 from rille.stages.evaluation.dem_comparison import figures
-from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric
+from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric, within
 from rille.stages.geometry.lattice import Lattice, mosaic
 
 ERRORS: Mapping[str, str] = {

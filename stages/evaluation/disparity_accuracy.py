@@ -12,8 +12,7 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
-from rille.stages.evaluation.coverage import within
-from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
+from rille.stages.facts.evaluation import Metric, MetricsFacts, metric, within
 from rille.stages.facts.matching import DisparityFacts
 
 

@@ -44,10 +44,8 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> dict[str, Metric]
     if len(path) == 0:
         return {"hazardous_share": share}
     cells = crossed_cells(path, lattice)
-    inside = ((cells >= 0) & (cells < lattice.shape)).all(axis=1)
     # Cells outside the exact map count as unknown, like its holes.
-    kinds = np.full(len(cells), UNKNOWN, dtype=np.uint8)
-    kinds[inside] = risk[cells[inside, 0], cells[inside, 1]]
+    kinds = lattice.values(risk, cells, UNKNOWN)
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
         "hazard_cells": metric(int((kinds == HAZARDOUS).sum()), "cells", f"crossed cells that are hazardous {truth}"),

@@ -22,8 +22,8 @@ from rille.stages.imaging.features import match, root_sift
 from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, fix
 from rille.stages.terrain.relief.grid import Grid
 
-FEWEST, MOST_SCALE = 12, 0.03
-"""Matches that must agree, and departure of their scale from 1."""
+FEWEST = 12
+"""Matches that must agree."""
 
 
 def register(images: tuple[Grid, Grid], heights: tuple[Grid, Grid]) -> Placement:
@@ -59,7 +59,7 @@ def place(a: Grid, b: Grid) -> Placement:
     motion, used = _agreed(p, q, near)
     agreeing = int(used.sum())
     scale = 1.0 if motion is None else math.hypot(motion[0, 0], motion[1, 0])
-    if motion is None or agreeing < FEWEST or abs(scale - 1.0) > MOST_SCALE:
+    if motion is None or agreeing < FEWEST or abs(scale - 1.0) > 0.03:
         text = f"the ortho images do not show one place: {agreeing} keypoints agree, at a scale of {scale:.3f}"
         raise DegenerateError("RIL-327", text, remedy="compare models in one frame, or of one place")
     # A turn alone, about the middle of the matches that agree.

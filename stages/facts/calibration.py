@@ -6,10 +6,9 @@ from rille.stages.core.declare import Facts
 
 
 class CalibrationFacts(Facts):
-    """``rig`` (its ``to_dict``) that is computed with, its ``baseline``, m, and whether it was ``changed``."""
+    """``rig`` (its ``to_dict``) that is computed with, and whether it was ``changed``."""
 
     rig: dict[str, Any]
-    baseline: float
     changed: bool
 
 
@@ -36,7 +35,6 @@ class RigFacts(CalibrationFacts):
     """The rig to be used; without a pair that can be used, the facts that there always are and ``warnings`` alone."""
 
     given: dict[str, Any]
-    mode: str
     source: str
     parameters: NotRequired[list[dict[str, Any]]]
     """Name, value, asked, sigma, unit, observed, freed, why; in mode ``fixed`` what would be changed."""
@@ -45,7 +43,6 @@ class RigFacts(CalibrationFacts):
     residual_before_px: NotRequired[float]
     residual_after_px: NotRequired[float]
     """RMS of inliers."""
-    pairs: NotRequired[int]
     matches: NotRequired[int]
     suspects: NotRequired[list[int]]
     """Pairs whose rows the rig does not explain."""
@@ -61,7 +58,6 @@ class SwapFacts(Facts):
     """Whether left and right are exchanged: shares of the matches that fit the rig either way, or once turned back."""
 
     frame: int
-    matches: int
     swapped: bool
     as_given: NotRequired[float]
     as_turned: NotRequired[float]

@@ -6,15 +6,13 @@ from rille.stages.core.declare import Facts
 
 
 class DisparityFacts(Facts):
-    """``preset``; whether the right image was ``aligned`` by a plane; how many pixels are ``usable``, of these the
-    share that is matched, and ``counts`` by reason; ``blur``, px, where the images differ by it
-    (``hfvm.coarse.ImageDifference``)."""
+    """``preset``; whether the right image was ``aligned`` by a plane; how many pixels are ``usable``, and of these
+    the share that is matched; ``blur``, px, where the images differ by it (``hfvm.coarse.ImageDifference``)."""
 
     preset: str
     aligned: bool
     usable: int
     match_rate: float | None
-    counts: dict[str, int]
     blur: NotRequired[float]
 
 

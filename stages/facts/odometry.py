@@ -47,7 +47,6 @@ class KeyframesFacts(Facts):
 
     basic: list[int]
     segments: list[list[int]]
-    rule: str
     overlap: list[float | None]
     why: list[str]
     displacement: list[float | None]
@@ -132,8 +131,6 @@ class TrajectoryFacts(Facts):
     pieces: list[list[int]]
     """Frames of each."""
     main: int
-    posed: int
-    in_world: int
     lost: list[dict[str, Any]]
     """Frame, cause, and the frames between which it is bridged."""
     breaks: list[dict[str, Any]]

@@ -20,7 +20,6 @@ class PathFacts(Facts):
     planner: str
     ground: str
     reason: str
-    blocking_row: int | None
     blocking_y: float | None
     """m"""
     ended_by: str
@@ -57,10 +56,8 @@ class LegFacts(Facts):
 
 
 class StopFacts(Facts):
-    """The image of a leg at which the vehicle stops (place in the leg, and frame; None: it does not), and why."""
+    """The image of a leg at which the vehicle stops (place in the leg; None: it does not), and why."""
 
     stop: int | None
-    frame: int | None
     reason: str
     kind: NotRequired[str]
-    frames: NotRequired[list[int]]

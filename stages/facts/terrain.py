@@ -95,10 +95,9 @@ class AuditFacts(Facts):
 
 
 class RadiometryFacts(Facts):
-    """Whole ``steps`` of log-exposure that each model's grey values are raised by, from ``seams`` ratios."""
+    """Whole ``steps`` of log-exposure that each model's grey values are raised by."""
 
     steps: dict[str, int]
-    seams: int
 
 
 class TileIndexFacts(Facts):
@@ -118,8 +117,5 @@ class MapFixFacts(Facts):
     source: str
     std: NotRequired[list[float]]
     """x, y, z, m, and rotation about them, rad."""
-    covariance: NotRequired[list[list[float]]]
-    """6 x 6."""
     fit: NotRequired[Json]
     """Figures of :class:`rille.stages.terrain.map_localization.Placement`, of elevations."""
-    ambiguous: NotRequired[bool]

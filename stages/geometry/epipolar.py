@@ -29,15 +29,6 @@ MAX_LINE_DISTANCE_PX = 2.0
 images, .22 to .32 of images one frame apart; in a desert .99, and up to .08."""
 
 
-MAX_OBLIQUE_DEG = 15.0
-"""Angle [degrees] of the baseline in the right image with its rows or columns up to which its own axes serve."""
-
-
-def standing(rig: Rig) -> bool:
-    """Whether one camera stands above the other in the left image: epipolar lines run along its columns."""
-    return bool(abs(rig.centre[1]) / rig.baseline >= math.cos(math.radians(45.0)))
-
-
 def turn_axes(rig: Rig) -> Floats:
     """Axes of pitch, yaw and roll in the right camera's frame, the columns of (3, 3).
 
@@ -46,22 +37,23 @@ def turn_axes(rig: Rig) -> Floats:
     """
     x, y, _ = rig.T_right_left.translation
     angle = math.remainder(math.atan2(y, x), math.pi)
-    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(MAX_OBLIQUE_DEG)
+    # 15 degrees to the image's rows or columns: up to there its own axes serve.
+    oblique = abs(math.remainder(angle, 0.5 * math.pi)) > math.radians(15.0)
     # 0.5: of the baseline. Where it leads along the view, lines radiate and show all turns.
     if not oblique or math.hypot(x, y) < 0.5 * rig.baseline:
         return np.eye(3)
     return rotation_exp([0.0, 0.0, angle])
 
 
-def standing_right(rig: Rig) -> bool:
-    """Whether the baseline leads along the y axis of :func:`turn_axes`, the columns of the right image."""
+def standing(rig: Rig) -> bool:
+    """Whether epipolar lines run along the columns of the right image: along the y axis of :func:`turn_axes`."""
     x, y, _ = np.abs(rig.T_right_left.translation @ turn_axes(rig))
     return bool(y > x)
 
 
 def angle_along(rig: Rig) -> str:
     """Name of the angle that moves the right image along its epipolar lines, and so all disparities."""
-    return "pitch" if standing_right(rig) else "yaw"
+    return "pitch" if standing(rig) else "yaw"
 
 
 def corrected(rig: Rig, correction: Floats) -> Rig:
@@ -195,7 +187,8 @@ def image_turn(rig: Rig, left: Floats, right: Floats) -> float:
 def _centre(rig: Rig, correction: Floats) -> tuple[Floats, Floats]:
     """Right camera's centre (3,) in the left frame, metres, and its derivatives (3, 2) by the two turns."""
     unit = rig.centre / np.linalg.norm(rig.centre)
-    axis = np.array([1.0, 0.0, 0.0]) if standing(rig) else np.array([0.0, 1.0, 0.0])
+    # In the left camera's frame, whose image may show the baseline along another axis than the right one's.
+    axis = np.eye(3)[0 if abs(unit[1]) >= math.cos(math.radians(45.0)) else 1]
     across = axis - unit * float(unit @ axis)
     across /= np.linalg.norm(across)
     forward = np.cross(unit, across)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rille.stages.core.arrays import Floats
+from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import InputError
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -63,6 +63,10 @@ class Camera:
         p = np.asarray(points, dtype=np.float64)
         z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
         return np.stack([self.fx * p[..., 0] / z + self.cx, self.fy * p[..., 1] / z + self.cy], axis=-1)
+
+    def holds(self, pixels: Floats) -> Bools:
+        """Which pixels (..., 2) lie within the outermost pixel centres."""
+        return np.asarray(((pixels >= 0) & (pixels <= [self.width - 1, self.height - 1])).all(axis=-1))
 
     def rays(self, pixels: ArrayLike) -> Floats:
         """Directions (..., 3) with z = 1 in the camera frame, of pixels (..., 2) column, row."""

@@ -132,6 +132,14 @@ class Lattice:
         p = np.asarray(xy, dtype=np.float64)
         return np.stack([self.j0 - p[..., 1] / self.cell, p[..., 0] / self.cell - self.i0], axis=-1)
 
+    def values(self, array: NDArray[Any], index: NDArray[Any], outside: float) -> NDArray[Any]:
+        """Values (...) of an array (row, col) in the cells next to fractional (row, col) (..., 2); ``outside`` where
+        there is none."""
+        at = np.rint(index)
+        inside = ((at >= 0) & (at < self.shape)).all(axis=-1)
+        row, col = np.moveaxis(np.where(inside[..., None], at, 0).astype(np.int64), -1, 0)
+        return np.where(inside, array[row, col], outside)
+
     def union(self, other: Lattice) -> Lattice:
         """Smallest lattice that holds both."""
         self._same_cell(other)

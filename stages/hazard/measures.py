@@ -121,14 +121,6 @@ def _roughness(terrain: HazardInput) -> Floats32:
     return np.sqrt(0.5 * deviation / np.maximum(pairs, 1.0)).astype(np.float32)
 
 
-def _inclination(terrain: HazardInput) -> Floats32:
-    return terrain.relief[1] * np.float32(1.0 / terrain.extent)
-
-
-def _metre(terrain: HazardInput) -> float:
-    return 1.0
-
-
 def _wheel_distance(terrain: HazardInput) -> float:
     return min(terrain.vehicle.track, terrain.vehicle.wheel_base)
 
@@ -153,7 +145,7 @@ class Measure(NamedTuple):
     words: str
     band: str
     description: str
-    length: Callable[[HazardInput], float] = _metre
+    length: Callable[[HazardInput], float] = lambda _: 1.0
     on_blocks: bool = False
     below: bool = False
     left: bool = False
@@ -171,8 +163,9 @@ class Measure(NamedTuple):
 
 MEASURES = (
     Measure(
-        "inclination", 1 << 0, _inclination, "max_slope_deg", 0.1, 0.95, "inclination", "inclination",
-        "highest minus lowest height in the wheel's window over its extent", length=lambda t: t.extent,
+        "inclination", 1 << 0, lambda t: t.relief[1] * np.float32(1.0 / t.extent), "max_slope_deg", 0.1, 0.95,
+        "inclination", "inclination", "highest minus lowest height in the wheel's window over its extent",
+        length=lambda t: t.extent,
     ),
     Measure(
         "range", 1 << 1, lambda t: t.relief[1], "clearance", 0.05, 0.8, "height range", "height_range",

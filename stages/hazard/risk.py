@@ -19,6 +19,7 @@ no relief, and their standard deviation is that of a height anywhere in that ran
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -82,7 +83,7 @@ def risk_map(
     Raises
     ------
     DegenerateError
-        The vehicle is wider than the map.
+        The vehicle is wider than the map, or longer than from corner to corner.
     """
     p = params or RiskParams()
     check_size(vehicle, elevation.shape, cell)
@@ -98,23 +99,22 @@ def risk_map(
 
 def check_size(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> None:
     """Refuse a vehicle that does not fit on the map."""
-    if wide := too_wide(vehicle, shape, cell):
-        remedy = "give vehicle.track and vehicle.wheel_diameter in metres at the scale of the sequence"
-        raise DegenerateError("RIL-431", wide, remedy=remedy)
+    if large := too_large(vehicle, shape, cell):
+        remedy = "give track, wheel_base and wheel_diameter of [vehicle] in metres at the scale of the sequence"
+        raise DegenerateError("RIL-431", large, remedy=remedy)
 
 
-def too_wide(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> str | None:
-    """How much wider than the map a vehicle is; None where it fits."""
+def too_large(vehicle: Vehicle, shape: tuple[int, ...], cell: float) -> str | None:
+    """How much wider or longer than the map a vehicle is; None where it fits."""
     width, side = 2.0 * vehicle.half_width, min(shape) * cell
-    return f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m" if width > side else None
-
-
-def _unjudged(z: Floats32) -> dict[str, NDArray[Any]]:
-    """Arrays of a risk map without a cell that is judged."""
-    none: dict[str, NDArray[Any]] = {m.band: np.full_like(z, np.nan) for m in MEASURES}
-    none |= {name: np.full_like(z, np.nan) for name in ("p_hazard", "p_wheel")}
-    none |= {"risk": np.full(z.shape, UNKNOWN, np.uint8), "reason": np.full(z.shape, UNKNOWN_BIT, np.uint16)}
-    return none | {"filled": np.zeros(z.shape, np.uint8), "elevation": z}
+    if width > side:
+        return f"the vehicle is {width:.3g} m wide over its wheels, the map only {side:.3g} m"
+    length, diagonal = 2.0 * vehicle.half_length, math.hypot(*shape) * cell
+    if length > diagonal:
+        return (
+            f"the vehicle is {length:.3g} m long over its wheels, the map only {diagonal:.3g} m from corner to corner"
+        )
+    return None
 
 
 def window_cells(side: float, cell: float) -> int:
@@ -141,7 +141,7 @@ def risk_stage(
 ) -> Bundle[RiskFacts]:
     """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits.
 
-    ``use``: "local" for the map of one pair of a run, which is unknown throughout where the vehicle is wider than it.
+    ``use``: "local" for the map of one pair of a run, which is unknown throughout where the vehicle does not fit on it.
     """
     lattices = [Lattice.from_dict(bundle.meta["lattice"]) for bundle in dem]
     whole = union(lattices)
@@ -151,8 +151,14 @@ def risk_stage(
     stds = [(part, d[name]) for part, d, name in zip(lattices, dem, names, strict=True) if name is not None]
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
     z, s = z.astype(np.float32), s.astype(np.float32)
-    narrow = use == "local" and too_wide(vehicle, whole.shape, whole.cell)
-    arrays = _unjudged(z) if narrow else risk_map(z, s, whole.cell, vehicle, params)
+    if use == "local" and too_large(vehicle, whole.shape, whole.cell):
+        nothing = {"risk": UNKNOWN, "reason": UNKNOWN_BIT, "filled": 0}
+        arrays: dict[str, NDArray[Any]] = {
+            a.name: np.full(z.shape, nothing.get(a.name, np.nan), a.dtype) for a in risk_stage.outputs
+        }
+        arrays["elevation"] = z
+    else:
+        arrays = risk_map(z, s, whole.cell, vehicle, params)
     meta: RiskFacts = {
         "lattice": whole.to_dict(),
         "frame": dem[0].meta.get("frame", "local"),

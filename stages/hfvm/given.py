@@ -38,18 +38,15 @@ MIN_BORNE_OUT = 0.1
 """Share of the known pixels of a map that the images bear out, below which it is read otherwise; of a map of the
 matcher's quality it is 0.8."""
 
-MIN_OWN, MIN_BETTER = 0.6, 1.3
-"""The same share below which a map may be the right image's; and times it that must be borne out if it is. Of five of
-Middlebury's pairs .14 to .52 of the right image's map are, .45 to .90 of the left one's."""
-
 
 def of_right_image(left: Pyramid, right: Pyramid, column: AnyArray, params: HfvmParams, own: float) -> bool:
     """Whether a map, of which the images bear out a share as the left one's, is the right image's, as they see it."""
-    if own >= MIN_OWN:
+    # Of five of Middlebury's pairs .14 to .52 of the right image's map are borne out, .45 to .90 of the left one's.
+    if own >= 0.6:
         return False
     moved, hit = _reverse(-column, np.isfinite(column), left.shape, -NEAR_SIGN)
     moved[~hit] = np.nan
-    return borne_out(check(left, right, moved, params), moved) > max(MIN_BORNE_OUT, MIN_BETTER * own)
+    return borne_out(check(left, right, moved, params), moved) > max(MIN_BORNE_OUT, 1.3 * own)
 
 
 def borne_out(arrays: dict[str, AnyArray], column: AnyArray) -> float:

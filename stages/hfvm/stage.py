@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, stage
-from rille.stages.core.validity import Mask, counts
+from rille.stages.core.validity import Mask, matched
 from rille.stages.facts.matching import DisparityFacts
 from rille.stages.hfvm import matcher, paper
 from rille.stages.hfvm.coarse import ImageDifference
@@ -112,13 +112,11 @@ def match_pyramids(
 
 def facts(arrays: Mapping[str, AnyArray], params: HfvmParams, unlike: ImageDifference, usable: int) -> DisparityFacts:
     """Facts of disparities; ``usable``: how many pixels of the left image are."""
-    bits = counts(arrays["validity"])
     found: DisparityFacts = {
         "preset": params.preset,
         "aligned": unlike.aligned,
         "usable": usable,
-        "match_rate": bits["matched"] / usable if usable else None,
-        "counts": bits,
+        "match_rate": int(matched(arrays["validity"]).sum()) / usable if usable else None,
     }
     if unlike.blur:
         found["blur"] = unlike.blur

@@ -23,9 +23,6 @@ PIXEL_CENTRE = 0.5
 UNIT_BYTES = 512.0
 """Length of COLMAP's byte descriptors."""
 
-MAX_RATIO, MAX_DISTANCE = 0.8, 0.7
-"""COLMAP's limits of a match: angle to the nearest descriptor over that to the second, and that angle, radians."""
-
 MAX_FEATURES, MAX_IMAGE_SIDE = 1300, 1400
 """Features of an image, of most contrast; and pixels of its longer side, above which it is reduced before."""
 
@@ -121,7 +118,8 @@ def match(a: Floats32, b: Floats32) -> NDArray[np.uint32]:
 def _clear(best: Floats32, second: Floats32) -> Bools:
     """Which products of descriptors are those of a match, clearly better than the second best."""
     near, next_near = (np.arccos(np.minimum(p / UNIT_BYTES**2, 1.0)) for p in (best, second))
-    return np.asarray((near <= MAX_DISTANCE) & (near < MAX_RATIO * next_near))
+    # COLMAP's limits: the angle to the nearest descriptor, radians, and over that to the second.
+    return np.asarray((near <= 0.7) & (near < 0.8 * next_near))
 
 
 def matched_points(a: Bundle, b: Bundle) -> tuple[Floats, Floats]:

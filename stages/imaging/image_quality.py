@@ -26,10 +26,6 @@ MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 MAX_GREY_ROWS = 0.1
 """Share of the rows of an image with one grey value, beyond those of the other image, that is no chance."""
 
-MIN_CONTRAST_GREY = 2.5
-"""Standard deviation of an image's grey values, of 255, below which noise and rounding hide its landmarks: rendered
-ground with noise of 0.8 gave all poses down to 2.8, and none from 2.4 on."""
-
 MIN_NOISE_SHARPNESS, MIN_NOISE_DETAIL = 4.3, 0.18
 """Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`texture`); photographs have a
 sharpness of about 1, or, with strong noise, a smaller detail: their grey values deviate by more than the noise."""
@@ -139,7 +135,9 @@ def faint(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
     lines = []
     for side, looks in sides.items():
         deviation = float(np.median([seen["deviation"] for seen in looks])) if looks else math.inf
-        if deviation < MIN_CONTRAST_GREY:
+        # 2.5: of 255, below which noise and rounding hide landmarks: rendered ground with noise of 0.8 gave all poses
+        # down to 2.8, and none from 2.4 on.
+        if deviation < 2.5:
             lines.append(
                 f"the {side} images are faint: their grey values deviate by {deviation:.1f} of 255 (median), so that "
                 "landmarks drown in noise: give more light, a longer exposure or images of more bits"

@@ -17,8 +17,6 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.kernel import kernel
 
-OVERRELAXATION = 1.7
-"""Factor on each step, which stays convergent below 2."""
 BORDER = 2
 """Empty cells around the field: a second difference reaches two cells."""
 
@@ -79,7 +77,8 @@ def _sweep(field, across, down, goal, inverse, sweeps):  # type: ignore[no-untyp
     (its first end, second end and middle), then with the column. Of these only the two cells before it in its row are
     moved just before. Everything else is therefore summed up for the whole row first, many cells at a time.
     """
-    two, overshoot = np.float32(2.0), np.float32(OVERRELAXATION)
+    # 1.7: factor on each step, which stays convergent below 2.
+    two, overshoot = np.float32(2.0), np.float32(1.7)
     step = overshoot * inverse
     stay = np.where(inverse > 0.0, np.float32(1.0) - overshoot, np.float32(1.0)).astype(np.float32)
     rows, cols = goal.shape

@@ -158,7 +158,6 @@ def keyframes_stage(
     meta: KeyframesFacts = {
         "basic": basic,
         "segments": segments(basic, frames),
-        "rule": f"every {params.stride}" if stride else f"overlap {params.overlap:g}",
         "overlap": overlap,
         "why": ["first frame", *why],
         "displacement": [step.displacement for step in moves],

@@ -33,9 +33,6 @@ from rille.stages.odometry.displacements import NEIGHBOURS, Motion, fit_affinity
 from rille.stages.odometry.moravec import clear_of_mask, interest_points
 from rille.stages.odometry.sharpness import equally_sharp
 
-MIN_NOISE = 0.5
-"""Grey levels: noise that every image is taken to have; rounding alone makes 0.3."""
-
 MAX_RETURN_PX = 0.5
 """Largest distance between a point and where its alignment there and back ends (4.3.3)."""
 
@@ -87,8 +84,9 @@ def track(frames: Sequence[Pyramid], motions: Sequence[Motion], params: TrackPar
     first = frames[0]
     seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise)
     if 4 * len(seeds) < params.points:
-        # Of little contrast (snow, night), with less noise than is usual.
-        params = params.model_copy(update={"noise": min(params.noise, max(first.noise, MIN_NOISE))})
+        # Of little contrast (snow, night), with less noise than is usual; at least 0.5 grey levels, as rounding alone
+        # makes 0.3.
+        params = params.model_copy(update={"noise": min(params.noise, max(first.noise, 0.5))})
         seeds = interest_points(first.images[0], first.valid[0], params.points, noise=params.noise)
     state = Tracks.born(seeds.astype(np.float64), 0, len(frames))
     for j, motion in enumerate(motions, start=1):

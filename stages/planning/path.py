@@ -43,7 +43,7 @@ from rille.stages.core.errors import InputError
 from rille.stages.facts.planning import PathFacts, RiskFacts
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.hazard.measures import MEASURES
-from rille.stages.hazard.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN, check_size, too_wide
+from rille.stages.hazard.risk import DOUBT_BIT, HAZARDOUS, UNKNOWN, check_size, too_large
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.grid8 import search
 from rille.stages.planning.path_ground import (
@@ -117,7 +117,6 @@ def describe(route: Route, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> di
         "planner": route.planner,
         "ground": route.ground,
         "reason": route.reason if len(xyz) else _why(route.reason, maps, vehicle),
-        "blocking_row": row,
         "blocking_y": None if row is None else (lattice.j0 - row) * lattice.cell,
         "ended_by": route.ended_by,
     }
@@ -211,7 +210,7 @@ def find_path(
     InputError
         Start or target lies outside the map, in a hazard or on unknown ground.
     DegenerateError
-        The vehicle is wider than the map.
+        The vehicle is wider than the map, or longer than from corner to corner.
     """
     params = params or PathParams()
     check_size(vehicle, lattice.shape, lattice.cell)
@@ -370,8 +369,8 @@ def path_stage(
     local = use == "local"
     maps = {name: np.asarray(risk[name]) for name in risk.arrays}
     ends = (None, None) if local else (params.start, params.target)
-    if local and (wide := too_wide(vehicle, lattice.shape, lattice.cell)):
-        route = Route(np.empty((0, 2), np.int64), np.empty((0, 3)), params.planner, "middle", (0, 0), wide)
+    if local and (large := too_large(vehicle, lattice.shape, lattice.cell)):
+        route = Route(np.empty((0, 2), np.int64), np.empty((0, 3)), params.planner, "middle", (0, 0), large)
     else:
         route = find_path(maps, lattice, vehicle, ends=ends, stretch=not local, params=params, begin=begin)
     facts = describe(route, maps, lattice, vehicle) | {"frame": risk.meta.get("frame", "local")}

@@ -187,10 +187,8 @@ class PlaneView:
 def rounded_cell(size: float) -> float:
     """The cell size of 1, 2 or 5 times a power of ten, m, that is nearest to ``size``."""
     first = math.floor(math.log10(size))
-    return min((m * 10.0**e for e in (first, first + 1) for m in _125), key=lambda step: abs(math.log(step / size)))
-
-
-_125 = (1.0, 2.0, 5.0)
+    steps = (m * 10.0**e for e in (first, first + 1) for m in (1.0, 2.0, 5.0))
+    return min(steps, key=lambda step: abs(math.log(step / size)))
 
 
 def view_points(samples: Samples, T_local_left: RigidTransform, slopes: Sequence[float] = (0.0, 0.0)) -> PlaneView:
@@ -233,7 +231,7 @@ def view_ground(rig: Rig, R_local_left: Floats, plane: Sequence[float]) -> Plane
     rho = rays @ (np.array([-a, -b, 1.0]) @ R_local_left) / c
     with np.errstate(divide="ignore", invalid="ignore"):
         right = rig.right.project(rig.T_right_left.apply(rays / rho[:, None]))
-        in_both = (rho > 0) & ((right >= 0) & (right <= [rig.right.width - 1, rig.right.height - 1])).all(-1)
+        in_both = (rho > 0) & rig.right.holds(right)
     if not in_both.any():
         raise DegenerateError(
             "RIL-345",

@@ -167,19 +167,38 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
     # model.
     wide = replace(around, distance=around.distance + far, turn=min(around.turn + math.radians(20.0), math.pi))
     ground = ground.within((wide.x, wide.y), wide.distance + far + math.hypot(*middle[:2]) + 2.0 * ground.cell)
-    coarse = ground
+    coarse = _searchable(ground, area, far, wide)
+    fits = _fits(thin(model, coarse.cell), coarse, blocks, ground, wide, params)
+    best, other = _best(fits, around, far, NEIGHBOURS * coarse.cell)
+    placed = _placed(best, blocks, math.radians(params.sigma_tilt_deg))
+    return _against(placed, best, other) if other else placed
+
+
+def _searchable(ground: Grid, area: float, far: float, around: SearchArea) -> Grid:
+    """The map so coarse that it can be searched for a model of an area, m2, and a radius ``far``, m."""
     # Fewer than a hundred cells tell too little.
-    while _tries(coarse, far, wide) > MAX_TRIES and area > 400 * coarse.cell**2:
-        coarse = coarse.halved()
-    if (tries := _tries(coarse, far, wide)) > MAX_TRIES_AT_ALL:
+    while _tries(ground, far, around) > MAX_TRIES and area > 400 * ground.cell**2:
+        ground = ground.halved()
+    if (tries := _tries(ground, far, around)) > MAX_TRIES_AT_ALL:
         text = f"the map is too large to be searched: {tries:.1g} places and headings, at most {MAX_TRIES_AT_ALL:.0g}"
         raise InputError("RIL-840", text, remedy="name a start, or one that is nearer")
-    rough = thin(model, coarse.cell)
-    near = NEIGHBOURS * coarse.cell
+    return ground
+
+
+def _fits(
+    rough: ModelBlocks,
+    coarse: Grid,
+    blocks: ModelBlocks,
+    ground: Grid,
+    around: SearchArea,
+    params: MapLocalizationParams,
+) -> list[HeightFit]:
+    """Fits of the model on the map at the best places that the rough model has on the coarse map."""
+    middle, near = blocks.points.mean(axis=0), NEIGHBOURS * coarse.cell
 
     def fits_from(lean: Floats) -> Iterator[HeightFit]:
         """Fits at the best places of the model turned by ``lean`` (3, 3)."""
-        for start in _search(rough.points @ lean.T, lean @ middle, coarse, wide, params.min_overlap):
+        for start in _search(rough.points @ lean.T, lean @ middle, coarse, around, params.min_overlap):
             fit = _refined(rough, coarse, start @ RigidTransform(lean, np.zeros(3)), near, params)
             if fit := fit and _refined(blocks, ground, fit.pose, near, params):
                 yield fit
@@ -188,8 +207,13 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
     # The search takes the model as level. A vertical that is off is so everywhere, and found at wrong places, too.
     first = min(fits, key=lambda fit: fit.square, default=None)
     # 3.0: times the RMS of the differences; where the tilt lifts the edge by less it hides no place.
-    if first and np.linalg.norm(rotation_log(first.level)) * far > 3.0 * math.sqrt(first.square):
+    if first and np.linalg.norm(rotation_log(first.level)) * blocks.radius > 3.0 * math.sqrt(first.square):
         fits += fits_from(first.level)
+    return fits
+
+
+def _best(fits: list[HeightFit], around: SearchArea, far: float, near: float) -> tuple[HeightFit, HeightFit | None]:
+    """The best fit within the search, and the best of those that are no neighbours (``near``, m) of it, if any."""
 
     def apart(fit: HeightFit, x: float, y: float, heading: float) -> tuple[float, float]:
         """Distances, m, of the origin from a place, and of the farthest points by the turn alone."""
@@ -205,10 +229,9 @@ def fix(model: Grid, ground: Grid, around: SearchArea | None, params: MapLocaliz
             "the map or the model is too flat to tell the position, or nothing near the start fits",
             remedy="give a finer map, another start, or a model of more ground",
         )
-    placed = _placed(best, blocks, math.radians(params.sigma_tilt_deg))
     # If all of the best starts lead to one place there is no rival: other starts fit worse.
     rivals = [fit for fit in fits if max(apart(fit, *from_above(best.pose))) > near]
-    return _against(placed, best, min(rivals, key=lambda fit: fit.square)) if rivals else placed
+    return best, min(rivals, key=lambda fit: fit.square, default=None)
 
 
 def _tries(ground: Grid, far: float, around: SearchArea) -> float:
@@ -368,9 +391,7 @@ def map_localization_stage(
         "T_global_local": placed.pose.to_list(),
         "source": "aligned to the global map",
         "std": np.sqrt(np.diag(placed.covariance)).tolist(),
-        "covariance": placed.covariance.tolist(),
         "fit": dict(placed.figures),
-        "ambiguous": bool(placed.doubt),
     }
     if placed.doubt:
         meta["warnings"] = [f"the first pose in the global map is ambiguous: {placed.doubt}"]

@@ -28,8 +28,6 @@ MIN_CELLS = 100
 MAX_CELLS = 40_000
 """Cells of an overlap that are compared, about."""
 
-USABLE_GREY = (8.0, 247.0)
-"""Grey values that an exposure is read from: darker ones are noise, brighter ones saturated."""
 ARRAYS = ("elevation", "elevation_std", "ortho")
 
 
@@ -92,9 +90,9 @@ def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, A
 
 def _log_ratio(grey: Floats, other: Floats) -> float | None:
     """Median logarithm of the factor between the grey values; None where too few tell."""
-    low, high = USABLE_GREY
-    # Beside the rims of the images an elevation has no grey value: NaN, which is in no range.
-    good = (np.minimum(grey, other) > low) & (np.maximum(grey, other) < high)
+    # Darker values are noise, brighter ones saturated. Beside the rims of the images an elevation has no grey value:
+    # NaN, which is in no range.
+    good = (np.minimum(grey, other) > 8.0) & (np.maximum(grey, other) < 247.0)
     if np.count_nonzero(good) < MIN_CELLS:
         return None
     return float(np.median(np.log(grey[good] / other[good])))

@@ -71,5 +71,4 @@ def radiometry_stage(
         if seam["log_ratio"] is not None
     ]
     steps = level({int(pair): centre for pair, centre in centres.items()}, ratios)
-    steps_by_pair = {str(pair): n for pair, n in sorted(steps.items())}
-    return Bundle({}, {"steps": steps_by_pair, "seams": len(ratios)})
+    return Bundle({}, {"steps": {str(pair): n for pair, n in sorted(steps.items())}})

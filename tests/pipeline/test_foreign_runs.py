@@ -28,6 +28,7 @@ from rille.pipeline.export.output import unpack
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.export.read_dem import frames_of, read_elevation
+from rille.pipeline.runs import crate
 from rille.stages.core.declare import Bundle
 
 ROW = '{"label": "a", "stage": "hfvm", "status": "computed", "key": "k", "seconds": 1, "kernel": 1, "digest": "d"}\n'
@@ -254,15 +255,15 @@ def test_a_run_whose_frames_are_none_has_no_cameras(tmp_path: Path, content: str
 def test_a_crate_that_is_none(tmp_path: Path, text: str) -> None:
     (tmp_path / rocrate.METADATA).write_text(text)
     with raises("RIL-023"):
-        rocrate.read(tmp_path)
+        crate.read(tmp_path)
 
 
 def test_a_crate_of_data_alone_is_no_run(tmp_path: Path) -> None:
     """Whatever its text mentions."""
-    assert rocrate.read(tmp_path) is None
+    assert crate.read(tmp_path) is None
     root = {"@id": "./", "@type": "Dataset", "mentions": {"@id": "#run"}}
     (tmp_path / rocrate.METADATA).write_text(json.dumps({"@graph": [root]}))
-    assert rocrate.read(tmp_path) is None
+    assert crate.read(tmp_path) is None
 
 
 def test_a_crate_takes_no_file_along_that_a_link_names(run: Path, tmp_path: Path) -> None:

@@ -26,8 +26,9 @@ from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import run_files
+from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
-from rille.pipeline.runs.session import late, memory_limit, resolved, settings, settings_of_run
+from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 from rille.stages.core.quantities import count, some
 
 

@@ -8,6 +8,7 @@ from rille.pipeline.commands import batch
 from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.runs import session
+from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.options import COMPLETE, HOLES, DriveOptions, Options
 from rille.stages.core.errors import warning
 from rille.stages.core.quantities import some
@@ -37,7 +38,7 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
 
 def _perform(seq: str, options: Options, verb: str = "reconstruct") -> tuple[int, Path]:
     """Run a sequence, or the run of a crate again; return the exit code and the folder of the results."""
-    seq, options, crate = session.resolved(seq, options)
+    seq, options, crate = resolved(seq, options)
     result = session.perform(seq, options, verb=verb)
     result.print()
     if crate is None:

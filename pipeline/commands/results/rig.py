@@ -79,7 +79,8 @@ def rig(
         with lookup.reading(folder):
             artifacts = RunArtifacts(folder, store)
             given[lookup.name(folder)] = artifacts.one("rig").meta["given"]
-            matches[lookup.name(folder)] = list(_matches(artifacts))
+            pairs = map(PointPairs.of, artifacts.all("orientation").values())
+            matches[lookup.name(folder)] = [pair for pair in pairs if len(pair.left) >= MIN_MATCHES]
     other = next((name for name, one in given.items() if one != next(iter(given.values()))), None)
     if other is not None:
         text = f"run {other} has another calibration than {next(iter(given))}"
@@ -92,14 +93,6 @@ def rig(
         warn(line)
     print(f"wrote        {output}\nnext         in the manifest of each sequence:")
     print(f'\n[rig]\nfile = "{output.resolve()}"')
-
-
-def _matches(artifacts: RunArtifacts) -> Iterator[PointPairs]:
-    """Matches of the pairs of a run that have enough of them."""
-    for one in artifacts.all("orientation").values():
-        left, right = (np.asarray(one[side], dtype=np.float64) for side in ("left", "right"))
-        if len(left) >= MIN_MATCHES:
-            yield PointPairs(one.meta["pair"], left, right)
 
 
 def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigParams) -> Joint:

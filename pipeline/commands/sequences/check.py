@@ -28,9 +28,10 @@ from rille.pipeline.flow.builders import Builder, name_graph
 from rille.pipeline.flow.reconstruction import vertical
 from rille.pipeline.flow.selection import spread
 from rille.pipeline.runs import input_checks as judge
+from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
-from rille.pipeline.runs.session import resolved, settings
+from rille.pipeline.runs.session import settings
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
 from rille.stages.imaging.image_quality import glance

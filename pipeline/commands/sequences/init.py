@@ -56,7 +56,7 @@ def init(
     needed = needs(text)
     left = hindrance(path) if not needed else None
     if left is not None:
-        needed = [f"{left.message}: {left.remedy}" if left.remedy else left.message]
+        needed = [str(left)]
     elif hindered is not None:
         print(f"{directory} does not open as it is: {hindered.message}")
     print("\n".join(_report(findings, path, needed)))

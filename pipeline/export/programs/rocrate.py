@@ -2,7 +2,8 @@
 
 https://www.researchobject.org/ro-crate/specification/1.1. The crate holds copies of the run's files, each with its
 SHA-256. The run is an action, whose objects are the parameters and the digests of all files that it read, and whose
-instruments are Rille and the packages that results depend on. `rille reconstruct CRATE` runs it again and compares.
+instruments are Rille and the packages that results depend on. `rille reconstruct CRATE` runs it again and compares
+(:mod:`rille.pipeline.runs.crate`).
 """
 
 from __future__ import annotations
@@ -10,12 +11,9 @@ from __future__ import annotations
 import hashlib
 import json
 import mimetypes
-import os
-import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from rille.datasets.text.reading import TABLE, read_text
@@ -67,7 +65,7 @@ def _files(folder: Path, name: str, what: str) -> Iterator[Entity]:
     for path in sorted(p for p in top.rglob("*") if p.is_file()) if top.is_dir() else [top]:
         at, kind = path.relative_to(folder).as_posix(), mimetypes.guess_type(path.name)[0] or "application/octet-stream"
         size = str(path.stat().st_size)
-        yield _entity(at, "File", at, description=what, contentSize=size, encodingFormat=kind, sha256=_sha256(path))
+        yield _entity(at, "File", at, description=what, contentSize=size, encodingFormat=kind, sha256=sha256(path))
 
 
 def _about(run: Path, facts: Mapping[str, Any], files: list[Entity], inputs: list[Entity]) -> Iterator[Entity]:
@@ -107,53 +105,6 @@ def _programs(versions: Mapping[str, str]) -> Iterator[Entity]:
         yield _entity(f"#{name}", "SoftwareApplication", name, version=version, **more)
 
 
-# -- rerun of a crate ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Crate:
-    """A run described by a crate: its sequence, the options of its command by name, and the SHA-256 of each result."""
-
-    folder: Path
-    sequence: str
-    options: Mapping[str, tuple[str, ...]]
-    digests: Mapping[str, str]
-
-    def unlike(self, run: Path) -> list[str]:
-        """Results of the crate that differ in a run, or are missing there."""
-        return [name for name, digest in self.digests.items() if _sha256(run / name) != digest]
-
-
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, empty where there is none."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-
-def read(folder: Path) -> Crate | None:
-    """The run that a crate describes; None: the folder is no crate, or one of data alone.
-
-    Raises
-    ------
-    InputError
-        It is no crate of a run of Rille.
-    """
-    path = folder / METADATA
-    if not os.path.isfile(path):
-        return None
-    try:
-        entities = {one["@id"]: one for one in json.loads(read_text(path, "crate", TABLE))["@graph"]}
-        if "./" in entities and "#run" not in entities:
-            return None
-        program, verb, sequence, *rest = shlex.split(entities["#run"]["name"])
-        if (program, verb) != ("rille", "reconstruct"):
-            raise ValueError(f"{program} {verb} is no reconstruction")
-        options: dict[str, tuple[str, ...]] = {}
-        for name, value in zip(rest[::2], rest[1::2], strict=True):  # each option of such a command has a value
-            options[name] = (*options.get(name, ()), value)
-        results = [one["@id"] for one in entities["#run"]["result"]]
-        digests = {str(name): str(entities[name]["sha256"]) for name in results if name not in catalogue.RENDERED}
-        if any(PurePath(name).is_absolute() or ".." in PurePath(name).parts for name in digests):
-            raise ValueError("a file lies outside of it")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        text = f"{path} describes no run of Rille ({type(error).__name__}: {error})"
-        raise InputError("RIL-023", text, remedy="`rille export RUN --to rocrate` writes one") from error
-    return Crate(folder, sequence, options, digests)

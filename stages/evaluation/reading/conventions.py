@@ -21,13 +21,9 @@ from rille.stages.geometry.geometry import RigidTransform, orthonormal
 from rille.stages.geometry.rigid import alignment, angle, compose, inverse, rms, spread, standing_out
 
 MIN_FRAMES, MAX_FRAMES = 4, 50
-# Share of the extent of a trajectory below which its truth is at rest.
 # Misfit over the extent, as read, up to which the estimate's own errors explain it; largest share of it, and of the
 # extent, that another reading may leave; and the misfit above which no estimate errs as much.
 MIN_MISFIT, MAX_SHARE, MAX_MISFIT, MUCH = 0.02, 0.4, 0.1, 0.3
-# Factor on the least misfit, and share of the extent added to it, up to which readings cannot be told apart; and the
-# factor by which an estimate's own errors may favour a reading of more changes.
-ALIKE_FACTOR, ALIKE_SHARE, SIMPLE_FACTOR = 1.5, 0.005, 4.0
 # Least turn of a body against the camera, radians: an estimate's own errors look like smaller ones.
 MIN_TURN = 0.3
 # Factor of length above which it is no error of the estimate; units, m: mm, cm, inches, feet, yards, km.
@@ -109,11 +105,12 @@ def better_reading(
         )
         doubt = "conventions: is it of this drive, and are its columns, and the order of the images, right?"
         return [f"{text} {doubt}"] if as_read > MUCH else []
-    # The simplest of those that fit: others may fit better only because of the estimate's errors.
-    most = min(MAX_SHARE * as_read, SIMPLE_FACTOR * best + ALIKE_SHARE)
+    # The simplest of those that fit: an estimate's own errors may favour one of more changes by a factor of 4. Up to
+    # 0.005 of the extent readings cannot be told apart.
+    most = min(MAX_SHARE * as_read, 4.0 * best + 0.005)
     changes = min(fit.changes for fit in fits if fit.misfit <= most)
     simple = sorted(fit for fit in fits if fit.changes == changes)
-    simple = [fit for fit in simple if fit.misfit <= ALIKE_FACTOR * simple[0].misfit + ALIKE_SHARE]
+    simple = [fit for fit in simple if fit.misfit <= 1.5 * simple[0].misfit + 0.005]
     told = list(dict.fromkeys(fit.words for fit in simple))
     if "" in told:
         return []

@@ -92,8 +92,8 @@ def corrected(camera: Camera, errors: Sequence[float] | Floats) -> Camera:
     return replace(camera, fx=camera.fx * larger, fy=camera.fy * larger, cx=column, cy=row)
 
 
-def errors_of(side: str, rig: Rig, errors: Sequence[float] | Floats) -> Floats:
-    """The first of ``errors``, stated for the left camera, of the camera of a ``side``.
+def corrected_like(side: str, camera: Camera, rig: Rig, errors: Sequence[float] | Floats) -> Camera:
+    """Camera of a ``side`` of a rig, changed by the first of ``errors``, which are stated for the left camera.
 
     Both cameras err alike as the left image shows it, so that disparities stay: what errs along the columns of the one
     does along the rows of the other, if that lies on its side.
@@ -103,7 +103,7 @@ def errors_of(side: str, rig: Rig, errors: Sequence[float] | Floats) -> Floats:
         (cosine, _, _), (sine, _, _), _ = rig.T_right_left.rotation
         turned = complex(*centre) * complex(cosine, sine) / math.hypot(cosine, sine)
         centre = [turned.real, turned.imag]
-    return np.array([larger, *centre])
+    return corrected(camera, [larger, *centre])
 
 
 def corrected_rig(
@@ -113,10 +113,10 @@ def corrected_rig(
 
     Where a pitch moves all disparities, as of cameras one above the other, pitch and yaw change places.
     """
-    first = [yaw, pitch] if epipolar.standing_right(rig) else [pitch, yaw]
+    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
     turned = epipolar.corrected(rig, np.array([*first, *others]))
-    left, right = (errors_of(side, rig, errors) for side in ("left", "right"))
-    return replace(turned, left=corrected(rig.left, left), right=corrected(rig.right, right))
+    left, right = (corrected_like(side, getattr(rig, side), rig, errors) for side in ("left", "right"))
+    return replace(turned, left=left, right=right)
 
 
 def toed_in(rig: Rig, angle: float) -> Rig:
@@ -147,7 +147,7 @@ def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
             raw = lens.distort(np.nan_to_num(pixels).reshape(-1, 2), given)
-            again = replace(lens, camera=corrected(lens.camera, errors_of(side, rig, errors)))
+            again = replace(lens, camera=corrected_like(side, lens.camera, rig, errors))
             pixels = again.undistort(raw, ideal).reshape(pixels.shape)
         focal, centre = np.array([ideal.fx, ideal.fy]), np.array([ideal.cx, ideal.cy])
         ray = (pixels - centre) / focal

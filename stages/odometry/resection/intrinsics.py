@@ -52,18 +52,6 @@ MIN_YAW_PX, MIN_YAW_CHANGE_PX = 0.4, 0.1
 (:class:`rille.stages.calibration.parameter_selection.RelativeParams`). A rig that was repaired has no prior either."""
 
 
-MIN_DISTANCE_PX = 0.5
-"""Error of all disparities, as later pairs show it, from which on a corrected yaw was none."""
-
-MAX_BIAS_SCATTER = 0.2
-"""Scatter over their size up to which segments agree on an error of all disparities."""
-
-MIN_READ_OUT, MAX_READ_OUT = 0.3, 1.2
-"""Time from the first to the last row, in intervals between frames, from which on a rolling shutter is named: of global
-shutters the tracks ask for 0.05 at most, and for 0.25 where the focal length is off by 8 %. An image is
-read before the next one is: beyond an interval the tracks show something else, as of a plane straight ahead."""
-
-
 class IntrinsicsParams(Params):
     """Parameters of the stage ``intrinsics``.
 
@@ -199,7 +187,8 @@ def hidden_yaw(segments: Sequence[Bundle[ResectFacts]], rig: Rig) -> float:
     if len(biases) < max(MIN_YAW_SEGMENTS, len(segments) / 2):
         return 0.0
     usual = float(np.median(biases))
-    agreed = abs(usual) > MIN_YAW_PX and mad_sigma(np.array(biases)) < MAX_BIAS_SCATTER * abs(usual)
+    # 0.2: scatter over the size up to which segments agree.
+    agreed = abs(usual) > MIN_YAW_PX and mad_sigma(np.array(biases)) < 0.2 * abs(usual)
     px = px_per_yaw(rig)
     return usual / px if agreed and px else 0.0
 
@@ -248,8 +237,9 @@ def creeping_focus(segments: Sequence[Bundle[ResectFacts]], turn: float, rig: Ri
     if not expected or len(shown) < MIN_SEGMENTS:
         return ""
     usual, error = float(np.median(shown)), 5.0 * mad_sigma(shown) / math.sqrt(len(shown))
-    # 0.3: of the correction. A street whose focus is fixed shows -0.4 to -0.3 px, 0.4 to 2 times the correction others.
-    if abs(usual) < max(MIN_DISTANCE_PX, error) or -usual / expected < 0.3:
+    # 0.5 px: from there on a corrected yaw was none. 0.3: of the correction. A street whose focus is fixed shows -0.4
+    # to -0.3 px, 0.4 to 2 times the correction others.
+    if abs(usual) < max(0.5, error) or -usual / expected < 0.3:
         return ""
     return (
         "the focus of both cameras creeps, or what is near moves alike (water), and the yaw of the rig was not wrong: "
@@ -303,7 +293,7 @@ def intrinsics_stage(
     """
     shown = shown_by(segments, params.sigma)
     used = Rig.from_dict(rig.meta["rig"])
-    focal, upright = used.left.fx, epipolar.standing_right(used)
+    focal, upright = used.left.fx, epipolar.standing(used)
     names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     believed = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
@@ -314,9 +304,12 @@ def intrinsics_stage(
     least = MIN_YAW_CHANGE_PX if made[-1] or rig.meta["changed"] else MIN_YAW_PX
     yaw, turn = alone(yaws, least / focal)
     bend, bent = alone(yaws, MIN_YAW_PX / focal, change=True)
-    read_out, late = alone(shown.read_out, MIN_READ_OUT)
-    # Wrong cameras look a little like other times, too; other times look like a wrong yaw.
-    late = 0.0 if common.wrong.any() or abs(late) > MAX_READ_OUT else late
+    # 0.3: time from the first to the last row, in intervals between frames, from which on a rolling shutter is named:
+    # of global shutters the tracks ask for 0.05 at most, and for 0.25 where the focal length is off by 8 %.
+    read_out, late = alone(shown.read_out, 0.3)
+    # Wrong cameras look a little like other times, too; other times look like a wrong yaw. An image is read before the
+    # next one is: beyond an interval (1.2) the tracks show something else, as of a plane straight ahead.
+    late = 0.0 if common.wrong.any() or abs(late) > 1.2 else late
     turn, bent = (0.0 if late else angle for angle in (turn, bent))
     sigma = np.sqrt(np.diag(common.covariance))
     correction = np.append(np.where(common.wrong, common.errors, 0.0)[:CORRECTED], 0.0)

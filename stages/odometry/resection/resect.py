@@ -51,20 +51,6 @@ MIN_JUMP_PX = 1.0
 rig was knocked; of sound rigs it stays below 0.2."""
 
 
-MIN_AGREEING_SHARE = 0.3
-"""Share of the landmarks below which a pose that these agree with is not believed: of a street 0.9 agree, by night and
-beside a mirror 0.6; of a crowd all over the image 0.2 may, with any pose."""
-
-
-FREE_BIAS_PX = 30.0
-"""Prior of an error common to all disparities where the calibration's is not believed."""
-
-
-MAX_TORN_SHARE = 0.2
-"""Share of a basic pair's disparities that depart otherwise than the others, by twice :data:`MIN_JUMP_PX`, from which
-on a part of one image is displaced; of sound pairs 0.02 do, by night 0.1."""
-
-
 @dataclass(frozen=True)
 class SegmentPoses:
     """Poses of a segment's frames; see the stage's outputs. A lost frame has NaN, and its fact ``lost`` says why."""
@@ -139,7 +125,9 @@ def resect_segment(points: SegmentPoints, frames: Sequence[int], params: ResectP
                 trusted[others] = False
                 use = np.flatnonzero(known[:, j] & trusted)
                 posed = posed_by(use, j)
-            if (agreeing := int(posed.inlier.sum())) < MIN_AGREEING_SHARE * use.size:
+            # 0.3: share of the landmarks; of a street 0.9 agree, by night and beside a mirror 0.6; of a crowd all over
+            # the image 0.2 may, with any pose.
+            if (agreeing := int(posed.inlier.sum())) < 0.3 * use.size:
                 text = f"only {agreeing} of {use.size} landmarks agree with one pose: most move, or are mistracked"
                 raise DegenerateError("RIL-751", text, remedy="mask what moves by itself, or what repeats")
         except DegenerateError as error:
@@ -171,7 +159,8 @@ def common_bias(
     # 0.5: of the landmarks; of a rig that is turned by 0.5 degrees 0.9 agree then, by 1.5 degrees 0.6.
     if agreeing >= 0.5 * use.size:
         return {}
-    pixels, free = points.tracks[use, 1].astype(np.float64), params.model_copy(update={"bias_sigma": FREE_BIAS_PX})
+    # 30.0 px: the calibration's own prior is not believed.
+    pixels, free = points.tracks[use, 1].astype(np.float64), params.model_copy(update={"bias_sigma": 30.0})
     try:
         posed = resect(points.landmarks.take(use), pixels, points.camera, [points.T_local_key], free, frame)
     except DegenerateError:
@@ -252,7 +241,7 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     before, then = (Rig.from_dict(bundle.meta["rig"]) for bundle in (inputs.rig, inputs.rig_after))
     unit = right_pixels(then)
     use, off, depth = segment.inlier[:, -1] != 0, [], []
-    side, axes = int(epipolar.standing_right(then)), epipolar.turn_axes(then)[:2, :2]
+    side, axes = int(epipolar.standing(then)), epipolar.turn_axes(then)[:2, :2]
     for row, rig, pair in ((0, before, inputs.disparity), (-1, then, inputs.after)):
         disparity, matched, _ = matches_at(tracks[:, row].astype(np.float64), pair, unit)
         at = RigidTransform.from_matrix(segment.poses[row]).inverse().apply(segment.landmarks)
@@ -270,8 +259,9 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
     grows = depth[0][use] / depth[1][use] - 1.0
     jump, grown = jump_of(departs, grows)
     torn = float((np.linalg.norm(departs - np.median(departs, axis=0), axis=1) > 2 * MIN_JUMP_PX).mean())
+    # 0.2: of the disparities, from which on a part of one image is displaced; of sound pairs 0.02 depart, by night 0.1.
     # 0.25: of the landmarks; fewer are left of a wide turn, at the rim of the view, where disparities are worst.
-    if torn > MAX_TORN_SHARE and use.sum() >= 0.25 * len(use):
+    if torn > 0.2 and use.sum() >= 0.25 * len(use):
         return {"torn": torn}
     if np.linalg.norm(jump) <= MIN_JUMP_PX:
         return {"distance_px": float(grown @ epipolar.farther(then)) * unit}

@@ -39,10 +39,6 @@ from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal, rotation_exp
 from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, NO_VERTICAL, OWN_COVARIANCE, POSES
 
-MAX_TILT_DEG = 5.0
-"""Degrees between the verticals by the ground of two pairs: on a street and in a hall at most 2.7, by bad matches 5 to
-28."""
-
 
 class ChainLink(NamedTuple):
     """Poses (frames, 3, 4) T_local_left of a segment, key frame first, NaN of a lost frame.
@@ -211,7 +207,8 @@ def _unlike_verticals(
             if found.piece[key] == piece and level.meta["source"] == GROUND_PLANE:
                 up = found.poses[key, :, :3] @ RigidTransform.from_matrix(level.meta["T_local_left"]).rotation[2]
                 tilts[frames[key]] = math.degrees(math.atan2(math.hypot(up[0], up[1]), up[2]))
-        odd = [frame for frame, tilt in tilts.items() if tilt > MAX_TILT_DEG]
+        # 5.0 degrees: on a street and in a hall it is at most 2.7, by bad matches 5 to 28.
+        odd = [frame for frame, tilt in tilts.items() if tilt > 5.0]
         if odd:
             yield (
                 f"by the ground of {len(odd)} of {len(tilts)} pairs, first pair {odd[0]}, the vertical is off by up to "
@@ -243,8 +240,6 @@ def account(frames: list[int], found: Chained, causes: Mapping[int, str], vertic
         "verticals": list(verticals),
         "pieces": [[frames[k] for k in rows] for rows in members],
         "main": main,
-        "posed": len(posed),
-        "in_world": int((piece == main).sum()),
         "lost": lost,
         "breaks": [{"frame": k, "cause": causes[k]} for k in (frames[rows[0]] for rows in members[1:]) if k in causes],
     }

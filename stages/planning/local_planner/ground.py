@@ -129,7 +129,9 @@ class Ground:
         known, opened = self._split(gaps, x, y, slack)
         unknown = np.full(x.shape, UNKNOWN_COST)
         if self.footing.glanced is not None:
-            unknown[self._on(self.footing.glanced, x, y)] = FAR_COST
+            lattice = self.footing.lattice
+            at = lattice.index(np.stack([x, y], axis=-1))
+            unknown[lattice.values(self.footing.glanced, at, False)] = FAR_COST
         # Likely hazards, and gaps narrower than a wheel, which are the shadows of stones, remain when seen from nearer.
         stays = (gaps.gap <= self.vehicle.margin) | ((gaps.unknown <= 0) & (gaps.frontier > 0))
         unknown = np.where(stays, LIKELY_COST, unknown)
@@ -145,13 +147,6 @@ class Ground:
             beside = np.minimum(gaps.gap / self.vehicle.margin - 1.0, gaps.doubtful / self.vehicle.margin)
             price = price + PROXIMITY_COST * np.clip(1.0 - beside, 0.0, 1.0)
         return known, np.where(opened, price, np.inf)
-
-    def _on(self, mask: Bools, x: Floats, y: Floats) -> Bools:
-        """Values of a mask on the map at points; false outside."""
-        at = np.rint(self.footing.lattice.index(np.stack([x, y], axis=-1))).astype(np.int64)
-        inside = ((at >= 0) & (at < mask.shape)).all(axis=-1)
-        row, col = (np.where(inside, at[..., k], 0) for k in (0, 1))
-        return np.asarray(inside & mask[row, col])
 
     def clear(self, x: Floats, y: Floats, heading: Floats) -> bool:
         """Whether all of these poses may be driven."""

@@ -15,10 +15,9 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
-from rille.stages.planning.local_planner.ground import Ground
+from rille.stages.planning.local_planner.ground import Ground, Point
 from rille.stages.planning.local_planner.route import Piece, length_of, room_to_turn
 
-Point = tuple[float, float]
 Stand = tuple[float, float, float]
 """x, y (m) of the middle of a vehicle and its heading (rad to the left of y)."""
 

@@ -50,9 +50,8 @@ from rille.stages.planning.local_planner.route import (
     vertices,
     within_turn,
 )
-from rille.stages.planning.path_ground import cell_within
+from rille.stages.planning.path_ground import Point, cell_within
 
-Point = tuple[float, float]
 Before = tuple[Floats, NDArray[np.int8]]
 """Rest of a way: vertices (vertex, 2), m, and how it is driven (piece,), 1 ahead, -1 back."""
 

@@ -26,13 +26,10 @@ from rille.stages.geometry.rigid import posed
 from rille.stages.hazard.classification import HAZARDOUS, UNKNOWN, UNSEEN_BIT
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.local_planner.clearance import Footing, Hazards
-from rille.stages.planning.local_planner.ground import LocalPlannerParams
+from rille.stages.planning.local_planner.ground import LocalPlannerParams, Point
 from rille.stages.planning.local_planner.look import FieldOfView, PlannerMemory, Stand
 from rille.stages.planning.local_planner.policy import Before, Leg, plan_leg, shortest
 from rille.stages.terrain.occlusion_bounds import Bounds
-
-Point = tuple[float, float]
-
 
 HAZARD_MAPS = ("risk", "reason", "p_hazard", "p_wheel")
 MAX_CLEAR_PROBABILITY = 0.02

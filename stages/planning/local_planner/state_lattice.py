@@ -59,8 +59,7 @@ class PoseGrid:
 
     def places(self) -> tuple[Floats, Floats]:
         """x and y (row, col), m, of all places."""
-        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in self.shape), indexing="ij")
-        return self.xy(row, col)
+        return self.xy(*np.indices(self.shape, np.float64))
 
     def xy(self, row: Floats, col: Floats) -> tuple[Floats, Floats]:
         """Metres, of fractional rows and columns."""
@@ -90,7 +89,7 @@ class LatticeGraph:
     @staticmethod
     def of(footing: Footing, grid: PoseGrid, prices: Prices) -> LatticeGraph:
         """Compute the costs on a map; a vehicle covers the same ground backwards, so headings within 180 degrees do."""
-        row, col = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in grid.shape), indexing="ij")
+        row, col = np.indices(grid.shape, np.float64)
         price, known = (np.empty((3, HALF_TURN_HEADINGS, *grid.shape), kind) for kind in (np.float64, np.bool_))
         for k in range(HALF_TURN_HEADINGS):
             # Of all 16 headings: the turn to the left of the eighth ends at the ninth.

@@ -16,7 +16,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.errors import DegenerateError
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
+from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lattice import MAX_CELLS, Lattice
 from rille.stages.terrain.ground import PlaneView
 from rille.stages.terrain.locus.kernel import Dem
@@ -35,7 +35,8 @@ def explain(
     # At most 64 cells along either side are looked at.
     y, x = (np.unique(axis[np.linspace(0, len(axis) - 1, 64).astype(np.intp)]) for axis in (lattice.ys(), lattice.xs()))
     points = T_local_left.inverse().apply(np.stack(np.meshgrid(x, y, np.linspace(*z_range, 9)), axis=-1))
-    seen = [_inside(camera, p) for camera, p in ((rig.left, points), (rig.right, rig.T_right_left.apply(points)))]
+    sides = (rig.left, points), (rig.right, rig.T_right_left.apply(points))
+    seen = [camera.holds(camera.project(p)) for camera, p in sides]
     if not (seen[0] & seen[1]).any():
         left, right = (100.0 * float(s.any(axis=-1).mean()) for s in seen)
         return DegenerateError(
@@ -60,13 +61,6 @@ def explain(
         remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma, or lower "
         "locus.cell_size",
     )
-
-
-def _inside(camera: Camera, points: Floats) -> Bools:
-    """Which points (..., 3) of a camera's frame lie in its image."""
-    pixels = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=-1))
 
 
 def coverage(

@@ -220,7 +220,7 @@ def test_frames_posed_are_counted_alike_all_over_the_report(tmp_path: Path) -> N
 @pytest.mark.parametrize(("y", "where"), [(0.63, "0.63 m ahead of"), (-1.12, "1.12 m behind")])
 def test_no_path_says_how_far_ahead_it_is_blocked(tmp_path: Path, y: float, where: str) -> None:
     made = bundles()
-    meta = {"found": False, "reason": "no way through", "blocking_row": 17, "blocking_y": y}
+    meta = {"found": False, "reason": "no way through", "blocking_y": y}
     meta |= {"length_m": None, "climb_m": None, "max_inclination": None}
     arrays = {**made["path"].arrays, "path": np.empty((0, 3))}
     made["path"] = made["local_path0"] = made["local_path4"] = Bundle(arrays, meta)

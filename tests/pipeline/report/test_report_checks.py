@@ -104,8 +104,8 @@ def test_images_out_of_order_are_asked_for(places, told) -> None:
 
 @pytest.mark.parametrize(("angle", "told"), [(0.0025, True), (0.0005, False), (0.0, False)])
 def test_a_toe_in_is_told_where_it_moves_disparities_at_the_sides(angle, told, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = Camera(707.0, 707.0, 612.5, 184.5, 1226, 370)
-    rig = Rig(camera, camera, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
+    left, right = (Camera(707.0 * n, 707.0 * n, 612.5 * n, 184.5 * n, 1226 * n, 370 * n) for n in (2, 1))
+    rig = Rig(left, right, RigidTransform(np.eye(3), np.array([-0.5, 0.0, 0.0])))
     monkeypatch.setattr(summary, "facts_of", lambda *_: {"errors": {"toe-in": [angle, 0.0001]}})
     products = SimpleNamespace(intrinsics=None)
     lines = summary.wrong_toe_in(SimpleNamespace(products=products, sequence=SimpleNamespace(rig=rig)))
@@ -146,7 +146,7 @@ def test_overlapping_models_and_the_choice_of_pairs_are_tabled(self_checked: Wri
 def test_consumers_survive_facts_that_are_not_there(tmp_path: Path) -> None:
     made = bundles() | checks()
     rig, agreement = made["rig"].meta, made["agreement"]
-    made["rig"] = Bundle({}, {"rig": rig["rig"], "mode": "fixed", "baseline": 0.097, "source": "given calibration"})
+    made["rig"] = Bundle({}, {"rig": rig["rig"], "source": "given calibration"})
     made["keyframes"] = Bundle({}, {"basic": list(BASIC)})
     made["agreement"] = Bundle(agreement.arrays, {})
     del made["crosscheck_accuracy"], made["orientation4"]

@@ -88,7 +88,6 @@ def bundles() -> dict[str, Bundle]:
     path_meta = {
         "found": True,
         "reason": "",
-        "blocking_row": None,
         "blocking_y": None,
         "length_m": 0.49,
         "climb_m": 0.004,
@@ -172,7 +171,6 @@ def checks() -> dict[str, Bundle]:
         "rig": REPAIRED.to_dict(),
         "given": RIG.to_dict(),
         "changed": True,
-        "mode": "pooled",
         "source": "given calibration, pitch repaired from 2 pairs",
         "parameters": [parameter | freed, parameter | held],
         "per_pair": [
@@ -208,7 +206,6 @@ def checks() -> dict[str, Bundle]:
         "basic": list(BASIC),
         "overlap": [None, 0.72],
         "why": ["first frame", "overlap"],
-        "rule": "overlap 0.7",
         "displacement": [3.0, 3.5, None, 4.0, 4.5],
         "warnings": [],
     }

@@ -25,12 +25,12 @@ def test_a_knock_is_undone_by_the_jump_of_far_disparities(axis, centre, sign, ri
     assert np.degrees(angle) == pytest.approx(0.3, abs=1e-3)
     np.testing.assert_allclose(used.T_right_left.matrix34, knocked.T_right_left.matrix34, atol=2e-5)
 
-    facts = {"rig": given.to_dict(), "changed": False, "warnings": ["as before"], "mode": "auto"}
+    facts = {"rig": given.to_dict(), "changed": False, "warnings": ["as before"], "source": "given"}
     said = knocked_stage(NoParams(), Bundle({}, facts), jump=[0.0, 1.5][:: 1 if axis == 0 else -1], cause="moved").meta
-    assert {name: said[name] for name in ("changed", "knocked", "mode")} == {
+    assert {name: said[name] for name in ("changed", "knocked", "source")} == {
         "changed": True,
         "knocked": "moved",
-        "mode": "auto",
+        "source": "given",
     }
     expected = sign * np.degrees(1.5 / 700.0)
     assert said["warnings"][0] == "as before"

@@ -42,8 +42,7 @@ def test_without_pairs_the_given_rig_passes_through(inputs):
     rig = toed_in_rig()
     meta = rig_stage.rig_stage.run(RigParams(), {"rig": rig.to_dict()}, inputs).meta
     assert meta["rig"] == rig.to_dict()
-    assert (meta["changed"], meta["warnings"], meta["mode"]) == (False, [], "pooled")
-    assert meta["baseline"] == pytest.approx((0.1**2 + 0.004**2 + 0.003**2) ** 0.5)
+    assert (meta["changed"], meta["warnings"]) == (False, [])
 
 
 def test_no_baseline_is_refused():
@@ -352,7 +351,6 @@ def test_pairs_with_few_matches_are_passed_over_and_told():
     pairs = street(2)
     few = PointPairs(5, pairs[0].left[:20], pairs[0].right[:20])
     found = facts(street_rig(), [*pairs, few])
-    assert found["pairs"] == 2
     assert found["warnings"] == ["1 of 3 pairs have too few matches for the rig"]
     alone = facts(street_rig(), [few])
     assert "used as given" in alone["warnings"][0]

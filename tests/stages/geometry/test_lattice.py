@@ -93,6 +93,17 @@ def test_mosaic_on_a_larger_target_is_nodata_outside() -> None:
     assert out.dtype == np.int16
 
 
+def test_values_are_those_of_the_cell_that_holds_a_point() -> None:
+    lattice = Lattice(1.0, 4.0, 0.5, 2, 3)
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    points = np.array([(1.0, 4.0), (1.24, 3.76), (2.2, 3.4), (2.3, 3.4), (0.7, 4.0), (np.nan, 4.0)])
+    found = lattice.values(array, lattice.index(points), np.nan)
+    assert np.array_equal(found, [0, 0, 5, np.nan, np.nan, np.nan], equal_nan=True)
+    mask = lattice.values(array > 4, lattice.index(points).reshape(2, 3, 2), False)
+    assert mask.dtype == np.bool_
+    assert np.array_equal(mask, [[False, False, True], [False] * 3])
+
+
 def test_what_is_refused() -> None:
     with raises("RIL-356"):
         Lattice(0.0, 0.0, 0.001, 10_000, 10_000)

@@ -327,7 +327,7 @@ def test_the_stage_assembles_tiles() -> None:
         risk_stage.run(RiskParams(), {"vehicle": MODEL.model_dump()}, {"dem": dems})["p_hazard"], one["p_hazard"]
     )
     assert sum(out.meta["shares"][k] for k in ("safe", "caution", "hazardous", "unknown")) == pytest.approx(1.0)
-    small = DEFAULT_VEHICLE.model_copy(update={"track": 0.05, "wheel_diameter": 0.04})
+    small = DEFAULT_VEHICLE.model_copy(update={"track": 0.05, "wheel_base": 0.1, "wheel_diameter": 0.04})
     exact = risk_stage.run(
         RiskParams(), {"vehicle": small.model_dump()}, {"dem": [Bundle({"elevation": z}, {"lattice": whole.to_dict()})]}
     )

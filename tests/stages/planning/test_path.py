@@ -347,19 +347,25 @@ def test_a_hazard_of_doubt_alone_is_said_to_be_one() -> None:
         find_path(given, lattice, SHORT, ends=((0.0, 0.06), None))
 
 
-def test_a_vehicle_wider_than_the_map_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("larger", "facts"), [({"track": 0.08}, ("0.095 m wide", "0.05 m")), ({"wheel_base": 1.0}, ("m long", "0.403 m"))]
+)
+def test_a_vehicle_larger_than_the_map_is_refused(larger: dict[str, float], facts: tuple[str, str]) -> None:
     lattice = Lattice.at(0, 40, CELL, 40, 5)
-    with raises("RIL-431", "0.095", "0.05"):
-        find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update={"track": 0.08}))
+    with raises("RIL-431", *facts):
+        find_path(maps(*level(lattice)), lattice, SHORT.model_copy(update=larger))
 
 
-@pytest.mark.parametrize("times", [2.0, 1e5])
-def test_the_map_of_one_pair_may_be_narrower_than_the_vehicle(times: float) -> None:
+SIZES = ("track", "wheel_base", "wheel_diameter")
+
+
+@pytest.mark.parametrize(
+    ("sizes", "times", "side"), [(SIZES, 2.0, "0.08 m"), (SIZES, 1e5, "0.08 m"), (["wheel_base"], 50.0, "0.408 m")]
+)
+def test_the_map_of_one_pair_may_be_smaller_than_the_vehicle(sizes: list[str], times: float, side: str) -> None:
     """Its cells are unknown and it has no path; of a whole world that is an error: units may be others."""
     lattice = Lattice.at(0, 40, CELL, 40, 8)
-    vehicle = SHORT.model_copy(
-        update={name: times * getattr(SHORT, name) for name in ("track", "wheel_base", "wheel_diameter")}
-    )
+    vehicle = SHORT.model_copy(update={name: times * getattr(SHORT, name) for name in sizes})
     dem = Bundle({"elevation": level(lattice)[1]}, {"lattice": lattice.to_dict(), "frame": "local"})
     given = {"vehicle": vehicle.model_dump()}
     risk = risk_stage.run(RiskParams(), given | {"use": "local"}, {"dem": [dem]})
@@ -368,8 +374,8 @@ def test_the_map_of_one_pair_may_be_narrower_than_the_vehicle(times: float) -> N
     path = path_stage.run(PathParams(), {"use": "local"}, {"risk": risk})
     check_outputs(path_stage, path)
     assert not path.meta["found"]
-    assert "the map only 0.08 m" in path.meta["reason"]
-    with raises("RIL-431", "0.08"):
+    assert f"the map only {side}" in path.meta["reason"]
+    with raises("RIL-431", side):
         risk_stage.run(RiskParams(), given, {"dem": [dem]})
 
 
