@@ -136,4 +136,6 @@ def matrix_at(table: TextTable) -> int | None:
         return None
     values = table.values(range(first, table.columns))
     whole = values[np.isfinite(values).all(1) & values.any(1)][:1].reshape(-1, 4)[:3, :3]
-    return first if len(whole) and np.allclose(whole @ whole.T, np.eye(3), atol=0.05) else None
+    # What is no rotation may be too large for a product.
+    rotation = len(whole) and np.abs(whole).max() < 2 and np.allclose(whole @ whole.T, np.eye(3), atol=0.05)
+    return first if rotation else None

@@ -130,7 +130,7 @@ def test_a_bad_frame_is_lost_named_and_bridged(
     report = json.loads((folder / "report.json").read_text())
     assert any(says in line for line in report["warnings"])
     assert not report["complete"]
-    assert [line[45:57].strip() for line in runs.describe([folder])] == ["state", "with holes"]
+    assert [line[45:57].strip() for line in runs.describe([folder])] == ["state", "1 missing"]
     assert report["metrics"]["trajectory_final_error"]["value"] < 1e-3
     assert (folder / "dem.tif").exists()
 
