@@ -79,13 +79,16 @@ class History:
 
     def save(self, nodes: Iterable[Handle]) -> None:
         """Note what a run used."""
-        known = _read(self._path)
-        used = {_name(h): h.key for h in nodes if h.ref is not None}
-        if all(known.get(name, [""])[0] == key for name, key in used.items()):
-            return
-        # Earlier keys remembered per label: enough for a user who goes back and forth between a few settings
-        known |= {name: [key, *(k for k in known.get(name, []) if k != key)][:4] for name, key in used.items()}
-        write_hint(self._path, known)
+        known, changed = _read(self._path), False
+        for handle in nodes:
+            name = _name(handle)
+            before = known.get(name, [])
+            if handle.ref is not None and before[:1] != [handle.key]:
+                changed = True
+                # Enough for a user who goes back and forth between a few settings.
+                known[name] = [handle.key, *(k for k in before if k != handle.key)][:4]
+        if changed:
+            write_hint(self._path, known)
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
