@@ -9,7 +9,8 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.samples import fixed_pattern, interlaced, mosaic
+from rille.datasets.images.patterns import fixed_pattern
+from rille.datasets.images.samples import interlaced, mosaic
 from rille.datasets.registry import open_sequence
 
 

@@ -97,8 +97,8 @@ class Sensors:
         clock = times if timed else None
         if "odometry" in given:
             stated, poses = given["odometry"], stacked("odometry", "poses", (3, 4))
-            plane = (np.array(stated.get(name, np.zeros(3)), dtype=np.float64) for name in ("up", "origin"))
-            used["odometry"] = RelativePrior(poses, clock, stated["drift"], stated["turn"], *plane)
+            plane = {name: np.array(stated.get(name, np.zeros(3)), dtype=np.float64) for name in ("up", "origin")}
+            used["odometry"] = RelativePrior(poses, clock, stated["drift"], stated["turn"], **plane)
         if "attitude" in given:
             R = stacked("attitude", "rotations", (3, 3))
             poses = np.concatenate([R, np.where(np.isnan(R[:, :, :1]), np.nan, 0.0)], axis=2)

@@ -206,7 +206,10 @@ def _sampled(obs: Observations, bound: float, frame: int) -> list[Pose]:
     # The size plays no part, but must be there.
     camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": list(Pinhole.of(obs.camera))}
     answer = sampled_pose(obs.pixels, obs.landmarks.position, camera, bound, 1999 * 100_003 + frame)
-    return [] if answer is None else [Pose.of(RigidTransform.from_matrix(answer[0]["cam_from_world"].matrix()))]
+    if answer is None:
+        return []
+    found, _ = answer
+    return [Pose.of(RigidTransform.from_matrix(found["cam_from_world"].matrix()))]
 
 
 def _without_inconsistent(

@@ -225,34 +225,43 @@ class RelativePrior:
         a, b = rows[:-1], rows[1:]
         measured, moves = motion(poses, a, b), motion(own.poses, a, b)
         # All that errors show in is of the camera: noise of the sensor would look like a scale or a motion of its own.
-        ways, count, clock = self._ways(moves), len(a), np.zeros((len(a), 6))
+        ways, count = self._ways(moves), len(a)
         way = np.linalg.norm(ways, axis=1)
-        if self.times is not None and count:
-            half = 0.5 * float(np.median(np.diff(own.times)))
-            before, after = (motion(resampled(own.poses, own.times, s), a, b) for s in (-half, half))
-            turned = rotation_log(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
-            clock = np.nan_to_num(np.concatenate([self._ways(after) - self._ways(before), turned], axis=1)) / (
-                2.0 * half
-            )
-        mount = MOUNT_SIGMA * np.concatenate([-cross_matrix(ways), np.eye(3) - moves[:, :, :3]], axis=1)
-        root, columns = np.zeros((count, 6, 6)), [mount]
-        if not self.drift:
-            root[:, 3:, 3:] = np.eye(3) / self.turn
-        else:
-            # Dead reckoning at rest is not exact.
-            step = np.maximum(way, 0.05 * np.median(way[way > 0]) if count else 0.0)[:, None, None]
-            steep = np.outer(self.up, self.up)
-            tilted = np.eye(3) * (self.up @ self.up) - steep
-            root[:, :3, :3] = (np.eye(3) - steep) / (self.drift * step) + steep / (TILT_SIGMA * step)
-            root[:, 3:, 3:] = (np.eye(3) - tilted) / (self.turn * step) + tilted / TILT_SIGMA
+        # Dead reckoning at rest is not exact.
+        step = np.maximum(way, 0.05 * np.median(way[way > 0]) if (way > 0).any() else 0.0)[:, None, None]
+        columns = [MOUNT_SIGMA * np.concatenate([-cross_matrix(ways), np.eye(3) - moves[:, :, :3]], axis=1)]
+        if self.drift:
             scale = np.concatenate([self.drift * ways, np.zeros((count, 3))], axis=1)
             turns = np.concatenate([np.zeros((count, 3, 3)), self.turn * step * np.eye(3)], axis=1)
             columns += [scale[:, :, None], turns]
-        shared = np.concatenate([*columns, OFFSET_SIGMA_S * clock[:, :, None]], axis=2)
+        shared = np.concatenate([*columns, OFFSET_SIGMA_S * self._per_second(own, a, b)[:, :, None]], axis=2)
         # Of the place of the measured point, not of the camera.
         measured[:, :, 3] += measured[:, :, :3] @ self.origin
         lever = np.broadcast_to(self.origin, (count, 3))
+        root = self._root(step)
         return Factors.of(np.stack([a, b], axis=1), measured, root, 6 if self.drift else 3, shared, lever)
+
+    def _per_second(self, own: OwnTrajectory, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
+        """Change (m, 6) of the motions from frames a to b if the clock is a second late; 0: there is no other clock."""
+        if self.times is None or not len(a):
+            return np.zeros((len(a), 6))
+        half = 0.5 * float(np.median(np.diff(own.times)))
+        before, after = (motion(resampled(own.poses, own.times, s), a, b) for s in (-half, half))
+        turned = rotation_log(after[:, :, :3] @ np.swapaxes(before[:, :, :3], 1, 2))
+        changes = np.concatenate([self._ways(after) - self._ways(before), turned], axis=1)
+        return np.asarray(np.nan_to_num(changes) / (2.0 * half))
+
+    def _root(self, step: Floats) -> Floats:
+        """Roots (m, 6, 6) of the information of single motions, whose ways are ``step`` (m, 1, 1), m."""
+        root = np.zeros((len(step), 6, 6))
+        if not self.drift:
+            root[:, 3:, 3:] = np.eye(3) / self.turn
+            return root
+        steep = np.outer(self.up, self.up)
+        tilted = np.eye(3) * (self.up @ self.up) - steep
+        root[:, :3, :3] = (np.eye(3) - steep) / (self.drift * step) + steep / (TILT_SIGMA * step)
+        root[:, 3:, 3:] = (np.eye(3) - tilted) / (self.turn * step) + tilted / TILT_SIGMA
+        return root
 
 
 @dataclass(frozen=True)
