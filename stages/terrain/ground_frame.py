@@ -113,12 +113,18 @@ def level(
     Raises
     ------
     DegenerateError
-        Left and right seem swapped, the rig has no baseline, or nothing is matched that a plane is fitted to.
+        Left and right seem swapped, or the rig has no baseline.
     """
     samples = sampled(matches, rig, params.sigma_disparity)
     if reference is not None:
-        stated = scene_plane(samples) if isinstance(reference, str) else stated_plane(reference)
-        return _on_plane(stated, samples)
+        try:
+            if not len(samples.rays):
+                remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
+                raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
+            return _on_plane(scene_plane(samples) if isinstance(reference, str) else stated_plane(reference), samples)
+        except NoGroundError as error:
+            facts = _facts(RigidTransform.identity(), REFERENCE_PLANE, _cell_without_ground(samples, rig))
+            return {**facts, "no_ground": str(error)}
     known_up, source = _given_vertical(vertical or VerticalHint())
     rays, rho, ground = samples.rays, samples.rho, None
     try:
@@ -224,9 +230,6 @@ def scene_plane(samples: Samples) -> GroundPlane:
     Across the view, elevations are a depth map: whatever the scene is, each matched pixel has its own place there.
     """
     rays, rho = samples.rays, samples.rho
-    if not len(rays):
-        remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
-        raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
     view = rays.mean(axis=0) / np.linalg.norm(rays.mean(axis=0))
     with suppress(NoGroundError):
         # A plane that is seen along itself makes no map.

@@ -279,7 +279,7 @@ def locus_stage(params: LocusParams, inputs: LocusInputs, *, frame: str, pair: i
         params = _limited(params, reference, level, local.cell)
     else:
         if level["plane"] is None or level["relief"] is None or ("no_ground" in level and params.cell_size is None):
-            raise DegenerateError("RIL-780", f"no elevation model without ground: {level['no_ground']}")
+            raise DegenerateError("RIL-780", f"no elevation model: {level['no_ground']}")
         cell = params.cell_size or reference["cell_size"]
         params = _limited(params, reference, level, cell)
         seen = view_matches(sampled(matches, rig, params.sigma_disparity), T_local_left)

@@ -269,6 +269,15 @@ def test_without_ground_elevations_are_distances_from_another_plane(reference: s
     assert facts["footprint"][1] - facts["footprint"][0] > 0.8
 
 
+@pytest.mark.parametrize("reference", [SCENE, [0.0, 0.0, -1.0, 0.0, 0.0, 1.5]])
+def test_a_pair_without_a_match_has_a_frame_though_no_surface(reference: str | list[float]) -> None:
+    # Trajectory and the models of other pairs depend on it.
+    column, row, usable = wall()
+    facts = level(column, row, np.zeros_like(usable), RIG, PARAMS, reference=reference)
+    assert (facts["source"], facts["plane"], facts["cell_size"] > 0) == (REFERENCE_PLANE, None, True)
+    assert "no pixel is matched" in facts["no_ground"]
+
+
 def test_a_scene_without_a_plane_is_measured_across_the_view() -> None:
     heap = [
         ball((x, y, -1.2 - 0.3 * ((5 * k) % 7)), 0.25)
