@@ -113,7 +113,8 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
             lacking = [path.name for one, path in theirs.items() if one not in ours]
     if len(maps) == len(lefts) and (len(maps) == 1 or not lacking):
         return maps
-    text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({ends(maps)}) for {count(len(lefts), 'left image')}"
+    those = ends(maps) if maps else f"none in {root}"
+    text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({those}) for {count(len(lefts), 'left image')}"
     text += f", none for {lacking[0]}" if lacking else ""
     remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
     raise InputError("RIL-901", text, remedy=remedy)

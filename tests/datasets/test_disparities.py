@@ -169,7 +169,7 @@ def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
         ("07.png 08.png 09.png", "07.pfm 09.pfm 10.pfm", "none for 08.png"),  # as many, but not of these images
         ("a.png b.png", "1.npy 2.npy 3.npy", ""),
         ("a.png b.png", "map.npy", ""),
-        ("a.png", "", ""),
+        ("a.png", "", "none in /"),
     ],
 )
 def test_maps_that_do_not_fit_are_refused(tmp_path, lefts, maps, lacking):
