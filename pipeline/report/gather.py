@@ -17,7 +17,7 @@ from rille.pipeline.flow.products import Stop
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.geometry import rigid
-from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.lattice import Lattice, union
 from rille.stages.odometry.resection.trajectory import world_poses
 
@@ -203,6 +203,6 @@ def _residuals(view: RunView, pair: int) -> tuple[Floats, Floats, Floats] | None
     left, right = (np.asarray(bundle[name], dtype=np.float64) for name in ("left", "right"))
     kept = np.asarray(bundle["weight"]) > 0
     left, right, given, used = left[kept], right[kept], view.sequence.rig, used_rig(view, pair)
-    before = distances(given, np.zeros(5), left, right)[0]
-    after = before if used.to_dict() == given.to_dict() else distances(used, np.zeros(5), left, right)[0]
+    before = line_distances(given, left, right)
+    after = before if used.to_dict() == given.to_dict() else line_distances(used, left, right)
     return left, before, after

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from rille.stages.calibration.relative_orientation import RIG, PointPairs
+from rille.stages.calibration.relative_orientation import PointPairs
 from rille.stages.core.arrays import Floats
-from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -56,7 +56,7 @@ def better_reading(rig: Rig, repaired: Rig, lenses: Mapping[str, Lens], pairs: S
     def apart(by: Mapping[str, Lens], rig: Rig = rig) -> Floats:
         """Distances, pixels, of the matches from their lines, their raw pixels undistorted by these lenses."""
         at = {s: by[s].undistort(lenses[s].distort(points[s], ideal[s]), ideal[s]) for s in ideal}
-        return distances(rig, np.zeros(RIG), *at.values())[0]
+        return line_distances(rig, *at.values())
 
     def off(by: Mapping[str, Lens], rig: Rig = rig) -> float:
         """Median distance, pixels."""

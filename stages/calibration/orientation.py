@@ -20,7 +20,7 @@ from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.validity import matched_back
 from rille.stages.facts.calibration import OrientationFacts
-from rille.stages.geometry.epipolar import NAMES, corrected, distances, image_turn
+from rille.stages.geometry.epipolar import NAMES, corrected, image_turn, line_distances
 from rille.stages.geometry.geometry import Rig
 
 
@@ -73,9 +73,7 @@ def orient(rig: Rig, matches: PointPairs) -> tuple[Floats, OrientationFacts]:
         return np.zeros(count), facts
     turns = [k < ANGLES for k in range(RIG)]
     fit = settle(rig, [matches], turns, RelativeParams.model_validate({}).priors(rig))
-    before, after = (
-        distances(one, np.zeros(RIG), matches.left, matches.right)[0] for one in (rig, corrected(rig, fit.x[:RIG]))
-    )
+    before, after = (line_distances(one, matches.left, matches.right) for one in (rig, corrected(rig, fit.x[:RIG])))
     weight = fit.weights[0]
     facts["row_offset"] = float(np.median(before[weight > 0]))
     facts["roll_deg"] = math.degrees(fit.x[NAMES.index("roll")])

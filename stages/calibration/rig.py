@@ -29,7 +29,6 @@ from rille.stages.calibration.relative_orientation import (
     BLOCKS,
     MIN_MATCHES,
     MIN_MATCHES_OF_BLOCK,
-    RIG,
     Linear,
     PointPairs,
     adjust,
@@ -46,8 +45,8 @@ from rille.stages.geometry.epipolar import (
     NAMES,
     angle_along,
     corrected,
-    distances,
     image_turn,
+    line_distances,
     standing,
     turn_axes,
 )
@@ -209,7 +208,7 @@ def _alone(given: Rig, matches: PointPairs, decision: Decision, params: RigParam
 
 def _distances(rig: Rig, pairs: Sequence[PointPairs]) -> list[Floats]:
     """Distances (n,) of each pair's matches from their epipolar lines, pixels."""
-    return [distances(rig, np.zeros(RIG), m.left, m.right)[0] for m in pairs]
+    return [line_distances(rig, m.left, m.right) for m in pairs]
 
 
 def _word(p: Parameter) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SynchronyFacts
-from rille.stages.geometry.epipolar import distances, standing, turn_axes
+from rille.stages.geometry.epipolar import line_distances, standing, turn_axes
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import matched_points
 from rille.stages.numeric.robust import mad_sigma
@@ -30,7 +30,7 @@ def row_offsets(rig: Rig, left: Bundle, right: Bundle) -> Floats | None:
     other. Neither is due to a shift in time.
     """
     at, other = matched_points(left, right)
-    apart, _ = distances(rig, np.zeros(5), at, other)
+    apart = line_distances(rig, at, other)
     # Far mismatches (a tenth of the image) would hide the effect of a shift on the others.
     near = np.abs(apart) < 0.1 * rig.right.height
     if near.sum() < 40:

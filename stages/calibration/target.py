@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import COEFFICIENTS, Lens
 from rille.stages.geometry.rigid import angle
@@ -308,7 +308,7 @@ class Adjustment:
         for view, (a, b) in zip(self.views, rms, strict=True):
             ideal = left.undistort(view.left, rig.left), right.undistort(view.right, rig.right)
             seen = np.isfinite(np.hstack(ideal)).all(axis=1)
-            off, _ = distances(rig, np.zeros(5), ideal[0][seen], ideal[1][seen])
+            off = line_distances(rig, ideal[0][seen], ideal[1][seen])
             epipolar = float(np.sqrt((off**2).mean())) if seen.any() else float("nan")
             out.append(ViewResidual(view.name, float(a), float(b), epipolar))
         return tuple(out)

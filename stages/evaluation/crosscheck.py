@@ -23,7 +23,7 @@ from pydantic import Field
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Array, Bundle, Memory, Params, stage
 from rille.stages.facts.evaluation import WindowFacts
-from rille.stages.geometry.epipolar import distances
+from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.imaging.features import PIXEL_CENTRE, match
 
@@ -172,7 +172,7 @@ def _line_distances(rig: Rig, frames: int, stereo: Mapping[int, tuple[Floats, Fl
     """
     out = np.full(frames, np.nan)
     for left, points in stereo.items():
-        out[left // 2] = np.median(np.abs(distances(rig, np.zeros(5), *points)[0]))
+        out[left // 2] = np.median(np.abs(line_distances(rig, *points)))
     return out
 
 

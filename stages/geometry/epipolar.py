@@ -90,8 +90,25 @@ def farther(rig: Rig) -> Floats:
     return np.asarray(along / max(float(np.linalg.norm(along)), 1e-9 * rig.baseline))
 
 
+def line_distances(rig: Rig, left: Floats, right: Floats) -> Floats:
+    """Signed distances (n,) of right points from the epipolar lines of left ones, (n, 2) column and row, pixels."""
+    essential = rig.T_right_left.rotation @ cross_matrix(_centre(rig, np.zeros(len(NAMES)))[0])
+    line = _homogeneous(left) @ (np.linalg.inv(rig.right.matrix).T @ essential @ np.linalg.inv(rig.left.matrix)).T
+    return np.asarray((_homogeneous(right) * line).sum(axis=1) / _length(line))
+
+
+def _homogeneous(points: Floats) -> Floats:
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def _length(line: Floats) -> Floats:
+    """Signed lengths (n,) of the normals of lines (n, 3), which so point down the image, or right if it is steep."""
+    down = np.where(np.abs(line[:, 0]) > np.abs(line[:, 1]), line[:, 0], line[:, 1])
+    return np.copysign(np.hypot(line[:, 0], line[:, 1]), down)
+
+
 def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Signed distances (n,) from the epipolar lines, pixels, and their derivatives (n, 7).
+    """Signed distances (n,) from the epipolar lines of the corrected rig, pixels, and their derivatives (n, 7).
 
     The derivatives are those by the correction, pixels per radian, and by column and row of the right point, which are
     the unit normals of the lines.
@@ -111,11 +128,9 @@ def distances(rig: Rig, correction: Floats, left: Floats, right: Floats) -> tupl
     upright = rotation @ cross_matrix(centre)
     to_slopes = [to_line @ cross_matrix(turns[:, i]) @ upright @ to_ray for i in range(3)]
     to_slopes += [to_line @ rotation @ cross_matrix(swings[:, i]) @ to_ray for i in range(2)]
-    p, q = (np.column_stack([points, np.ones(len(points))]) for points in (left, right))
+    p, q = _homogeneous(left), _homogeneous(right)
     line, *turned = (p @ matrix.T for matrix in (to_line @ upright @ to_ray, *to_slopes))
-    # The normal of a line points down the image, or to the right if the line is steep.
-    down = np.where(np.abs(line[:, 0]) > np.abs(line[:, 1]), line[:, 0], line[:, 1])
-    length = np.copysign(np.hypot(line[:, 0], line[:, 1]), down)[:, None]
+    length = _length(line)[:, None]
     normal, distance = line[:, :2] / length, (q * line).sum(axis=1) / length[:, 0]
     # Quotient rule: the length of the line's normal changes too.
     slopes = [((q * t).sum(axis=1) - (normal * t[:, :2]).sum(axis=1) * distance) / length[:, 0] for t in turned]

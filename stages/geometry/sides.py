@@ -13,7 +13,7 @@ import numpy as np
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError
-from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX, NAMES, beyond_infinity, distances
+from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX, beyond_infinity, line_distances
 from rille.stages.geometry.geometry import Rig
 from rille.stages.geometry.scale import right_pixels
 
@@ -29,7 +29,7 @@ def fits(rig: Rig, left: Floats, right: Floats, *, turned: bool = False) -> floa
     and in proportion to the column.
     """
     tolerance = MAX_LINE_DISTANCE_PX * right_pixels(rig)
-    off, _ = distances(rig, np.zeros(len(NAMES)), left, right)
+    off = line_distances(rig, left, right)
     if turned:
         column, line = right[:, 0] - right[:, 0].mean(), np.array([0.0, np.median(off)])
         for _ in range(6):
@@ -67,6 +67,8 @@ def refuse_mirrored(rig: Rig, left: Floats, right: Floats, fitting: float) -> No
 
 def refuse_exchanged(rig: Rig, left: Floats, right: Floats) -> None:
     """Refuse matches that fit the rig with its sides exchanged, or with its transformation inverted."""
+    if fits(rig, left, right) >= 0.5:
+        return  # no other rig can fit twice as many
     swapped, as_given, other_way = exchanged(rig, left, right)
     inverted = fits(replace(rig, T_right_left=rig.T_right_left.inverse()), left, right)
     if swapped or likelier(inverted, as_given):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Bundle
 from rille.stages.core.validity import matched as is_matched
-from rille.stages.geometry.epipolar import NAMES, distances, inverse_depth
+from rille.stages.geometry.epipolar import inverse_depth, line_distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.numeric.least_squares import irls
@@ -113,7 +113,7 @@ def landmarks_of(
     sigma = np.hypot(unit * disparity_sigma, relief)
     landmarks = triangulated(points, right, rig, T_local_left, sigma)
     depth = T_local_left.inverse().apply(landmarks.position)[:, 2]
-    off, _ = distances(rig, np.zeros(len(NAMES)), points, right)
+    off = line_distances(rig, points, right)
     meets = matched & (depth > 0) & (np.abs(off) <= unit * MAX_DISPARITY_STEP_PX)
     smooth = meets & np.isfinite(sigma)
     spread = np.linalg.norm(landmarks.per_pixel, axis=1) * sigma
