@@ -415,7 +415,7 @@ def _reads(run: RunView) -> tuple[object, ...]:
         *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
-        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes, s.odometry, s.priors),
+        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes, s.loose_odometry),
     )
 
 
