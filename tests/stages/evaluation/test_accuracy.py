@@ -12,7 +12,8 @@ from evo.core.trajectory import PosePath3D
 from scipy.spatial.transform import Rotation
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.evaluation.accuracy import accuracy_stage, nees, trajectory_accuracy
+from rille.stages.evaluation.accuracy import accuracy_stage, trajectory_accuracy
+from rille.stages.evaluation.claims import nees
 from rille.stages.geometry.geometry import rotation_exp
 from rille.stages.geometry.rigid import by_frame
 
