@@ -165,11 +165,8 @@ def propagation(key: RigidTransform, T_world_local: RigidTransform, world: Rigid
 
 def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     """Poses (frame, 3, 4) of the piece whose frame is the world, or of another one in its own; NaN elsewhere."""
-    poses = np.asarray(trajectory["poses"], dtype=np.float64)
-    if "piece" not in trajectory.arrays:
-        return poses
-    wanted = trajectory.meta.get("main", 0) if piece is None else piece
-    return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
+    wanted = trajectory.meta["main"] if piece is None else piece
+    return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], trajectory["poses"], np.nan)
 
 
 def _level(found: Chained, piece: int, up: Floats) -> None:
