@@ -28,7 +28,8 @@ from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import Header, sizes_of
 from rille.datasets.images.pairing import join, two_sides
 from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
-from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
+from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
+from rille.datasets.inspection.findings import Findings, FoundImages
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
 from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
