@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,9 +13,10 @@ from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size, relative_pose
 from rille.datasets.images import pairing
 from rille.datasets.images.kinds import line
-from rille.datasets.inspection.findings import Findings, FoundCalibration, relative
 from rille.datasets.inspection.tables import TABLES
+from rille.datasets.inspection.views import FoundImages, relative
 from rille.stages.core.errors import RilleError
+from rille.stages.geometry.geometry import RigidTransform, Sizes
 
 CALIBRATIONS = (
     *(".yaml", ".yml", ".xml", ".txt", ".toml", ".ini", ".cfg", ".conf", ".json"),
@@ -21,9 +24,37 @@ CALIBRATIONS = (
 )
 
 
-def find_calibration(found: Findings, texts: list[Path]) -> None:
-    """Find the one or the two calibration files that suit this rig best."""
-    read: dict[str, list[CalibratedCamera]] = {}
+@dataclass(frozen=True)
+class FoundCalibration:
+    """Suitable calibration files: one for both cameras or one each, relative to the folder.
+
+    ``names``: of the two cameras, if the file has more. ``mount``: T_reference_left, if the reference frame of the
+    files is not the left camera's, but mostly that of the body or of the IMU.
+    """
+
+    files: tuple[str, ...]
+    sizes: tuple[tuple[int, int] | None, tuple[int, int] | None]
+    baseline: float | None
+    cameras: int
+    names: tuple[str, str] | None = None
+    mount: RigidTransform | None = None
+
+    def suits(self, sizes: Sizes | None) -> bool:
+        """Whether it fits images of these sizes, as far as both are known."""
+        return sizes is None or all(own in (None, size) for own, size in zip(self.sizes, sizes, strict=True))
+
+
+class Calibrations(NamedTuple):
+    """The files that suit the images best, None where none does; other calibrations; and lines on what is not read."""
+
+    best: FoundCalibration | None
+    others: list[str]
+    unread: list[str]
+
+
+def find_calibration(folder: Path, texts: list[Path], views: FoundImages) -> Calibrations:
+    """Find the one or the two calibration files that suit the images of a folder best."""
+    read, unread = dict[str, list[CalibratedCamera]](), list[str]()
     for path in texts:
         try:
             cameras = read_cameras(path)
@@ -33,33 +64,34 @@ def find_calibration(found: Findings, texts: list[Path]) -> None:
             refused = re.match(r"RIL-(81\d|120|135)", getattr(error, "code", ""))
             named = "calib" in path.stem.lower() and getattr(error, "remedy", "") != KNOWN
             if refused or named or not other:
-                found.unread.append(" ".join(str(error).split()))
+                unread.append(" ".join(str(error).split()))
             continue
         if cameras:
-            read[relative(path, found.folder)] = of_size(cameras, found.views.sizes)
+            read[relative(path, folder)] = of_size(cameras, views.sizes)
     # Of equally good files one of two cameras rather than one of more.
     in_turn = sorted(read.items(), key=lambda item: len(item[1]) > 2)
-    candidates = [_calibration((name,), cameras, found.views.sides) for name, cameras in in_turn]
+    candidates = [_calibration((name,), cameras, views.sides) for name, cameras in in_turn]
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     # Cameras of other names differ by the same words as their images.
-    renamed = {name: _of_other_side(name, found.views.sides) for name in single}
+    renamed = {name: _of_other_side(name, views.sides) for name in single}
     pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
-    candidates += [_calibration(pair, [single[name] for name in pair], found.views.sides) for pair in pairs]
-    if candidates:
-        place = Path(found.views.left).parent
+    candidates += [_calibration(pair, [single[name] for name in pair], views.sides) for pair in pairs]
+    if not candidates:
+        return Calibrations(None, [], unread)
+    place = Path(views.left).parent
 
-        def rank(c: FoundCalibration) -> tuple[int, ...]:
-            above, beside = [place, *place.parents], Path(c.files[0]).parent
-            far = above.index(beside) if beside in above else len(above)
-            return c.suits(found.views.sizes), c.cameras, c.baseline is not None, -far, -len(c.files)
+    def rank(c: FoundCalibration) -> tuple[int, ...]:
+        above, beside = [place, *place.parents], Path(c.files[0]).parent
+        far = above.index(beside) if beside in above else len(above)
+        return c.suits(views.sizes), c.cameras, c.baseline is not None, -far, -len(c.files)
 
-        found.calibration = max(candidates, key=rank)
-        taken = found.calibration.files
-        found.others = [name for name in read if name not in taken]
-        each = [name for name in read if re.sub(r"\d+", "", name) == re.sub(r"\d+", "", taken[0])]
-        unlike = [name for name in each if len(each) == found.views.pairs and str(read[name]) != str(read[taken[0]])]
-        remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
-        found.unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
+    best = max(candidates, key=rank)
+    taken = best.files
+    each = [name for name in read if re.sub(r"\d+", "", name) == re.sub(r"\d+", "", taken[0])]
+    unlike = [name for name in each if len(each) == views.pairs and str(read[name]) != str(read[taken[0]])]
+    remedy = f"unlike {taken[0]}, which is taken for all images; write a manifest for each"
+    unread += [line("calibration", unlike, remedy)] if unlike and not taken[1:] else []
+    return Calibrations(best, [name for name in read if name not in taken], unread)
 
 
 def _of_other_side(name: str, sides: tuple[str, str]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rille.datasets.cameras import KNOWN
@@ -16,10 +17,9 @@ from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.headers import located
 from rille.datasets.images.kinds import hints, line, unread
 from rille.datasets.images.pairing import UNWRITABLE, natural, side_of, writable
-from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
-from rille.datasets.inspection.findings import Findings, relative
+from rille.datasets.inspection.calibration import CALIBRATIONS, FoundCalibration, find_calibration
 from rille.datasets.inspection.tables import CAMERA_WORDS, TABLES, table_kind
-from rille.datasets.inspection.views import COMPUTED, DEPTH, find_views
+from rille.datasets.inspection.views import COMPUTED, DEPTH, FoundImages, find_views, relative
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
@@ -34,6 +34,19 @@ PROSE = re.compile(r"read.?me|licen[cs]e|copying|changes", re.I)
 
 MASK = re.compile(r"(?<![a-z])masks?(?![a-z])(?!.*\.look$)", re.I)
 """In the names of masks of a camera; not in those of the pictures that `rille mask` writes beside them."""
+
+
+@dataclass
+class Findings:
+    """Findings in a folder; paths are relative to it."""
+
+    folder: Path
+    views: FoundImages
+    calibration: FoundCalibration | None = None
+    others: list[str] = field(default_factory=list)
+    masks: dict[str, str] = field(default_factory=dict)
+    tables: dict[str, list[str]] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
 
 
 def inspect(folder: Path) -> Findings:
@@ -73,8 +86,10 @@ def inspect(folder: Path) -> Findings:
     if len(texts) > MOST_TEXTS:
         found.unread.append(f"of {len(texts)} text files only the first {MOST_TEXTS} were looked at")
         texts = texts[:MOST_TEXTS]
-    find_calibration(found, [p for p in texts if p.suffix.lower() in CALIBRATIONS])
-    used = set(found.calibration.files if found.calibration else ()) | set(found.others)
+    tried = [p for p in texts if p.suffix.lower() in CALIBRATIONS]
+    found.calibration, found.others, lines = find_calibration(folder, tried, found.views)
+    found.unread += lines
+    used = {*found.others, *(found.calibration.files if found.calibration else ())}
     used |= {name.replace("intrinsic", "extrinsic") for name in used}  # OpenCV's pair of files
     for path in texts:
         if path.suffix.lower() not in TABLES or there[path] in used or any(str(path) in line for line in found.unread):

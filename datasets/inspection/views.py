@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from pathlib import Path
 
@@ -15,9 +16,9 @@ from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import split
 from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
-from rille.datasets.inspection.findings import FoundImages, relative
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
+from rille.stages.geometry.geometry import Sizes
 
 DEPTH = 4
 """Levels of folders that are searched; deeper ones are other data sets."""
@@ -26,6 +27,38 @@ COMPUTED = re.compile(
     r"(?<![a-z])(depth|disp|seg|mask|valid|flow|label|conf|normal|occl|semantic|instance|dem(?![a-z]))", re.I
 )
 """In the names of images and arrays that are no photographs, as beside those of simulators."""
+
+
+@dataclass(frozen=True)
+class FoundImages:
+    """The left and right images that were found.
+
+    Attributes
+    ----------
+    left, right : patterns relative to the folder.
+    pairs : number of pairs.
+    sizes : of the left and of the right images, if all of a side have the same.
+    why : how left and right were recognised.
+    trouble : why the images cannot be paired; empty: they can.
+    stamped : whether the left images' names are times, since 1970 or as date and time of day.
+    sides : the words or letters in the names that mark left and right.
+    absent : missing files of pairs, which are counted in ``pairs``.
+    lines : on the pairing by time stamps in the names, if these differ.
+    others : lines on images that are of another set of pairs, or of none.
+    """
+
+    left: str
+    right: str
+    pairs: int
+    sizes: Sizes | None
+    why: str
+    trouble: str = ""
+    stamped: bool = False
+    sides: tuple[str, str] = ("left", "right")
+    absent: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
+
 
 Named = dict[tuple[int, str], list[tuple[str, int, Path]]]
 """Names without the side's token, side and path of images by the number of the token and their folder without it."""
@@ -190,3 +223,8 @@ def pattern(paths: list[Path], folder: Path) -> str:
 def _common_start(words: list[str]) -> str:
     """Common beginning of all words."""
     return "".join(of[0] for of in takewhile(lambda letters: len(set(letters)) == 1, zip(*words, strict=False)))
+
+
+def relative(path: Path, folder: Path) -> str:
+    """Path relative to the folder, as in a manifest."""
+    return path.relative_to(folder).as_posix()
