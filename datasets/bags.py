@@ -28,7 +28,8 @@ from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import Header, sizes_of
 from rille.datasets.images.pairing import join, two_sides
 from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
-from rille.datasets.inspection import CALIBRATIONS, Findings, FoundImages, find_calibration
+from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
+from rille.datasets.inspection.views import FoundImages
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
 from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
@@ -230,9 +231,8 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
     infos = [_info(reader, path, topic) for topic in topics]
     missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
     if missing is not None:
-        found = Findings(path.parent, FoundImages("", "", 0, sizes, ""))
-        find_calibration(found, [p for p in sorted(path.parent.iterdir()) if p.suffix.lower() in CALIBRATIONS])
-        beside = found.calibration
+        texts = [p for p in sorted(path.parent.iterdir()) if p.suffix.lower() in CALIBRATIONS]
+        beside = find_calibration(path.parent, texts, FoundImages("", "", 0, sizes, "")).best
         if beside is None or beside.baseline is None:
             there = sorted({c.topic for c in reader.connections if c.msgtype == INFO})
             text = f"{path} has no {missing} of a calibrated camera (camera_info: {', '.join(there) or 'none'})"

@@ -217,3 +217,8 @@ class Sequence:
             if values is not None and len(values) != self.frames:
                 text = f"sequence {self.name}: {len(values)} {what.replace('_', ' ')} for {self.frames} frames"
                 raise InputError("RIL-273", text, remedy=f"give one entry of {what.replace('_', ' ')} a frame")
+
+    @property
+    def loose_odometry(self) -> bool:
+        """Whether dead reckoning is known, but not how good it is: the trajectory is not adjusted to it."""
+        return self.odometry is not None and "odometry" not in self.priors

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rille.stages.evaluation.accuracy import nees, trajectory_accuracy
+from rille.stages.evaluation.accuracy import trajectory_accuracy
+from rille.stages.evaluation.claims import nees
 from rille.stages.evaluation.reading.hand_eye import hand_eye
 from rille.stages.geometry.rigid import compose, inverse, posed, umeyama
 

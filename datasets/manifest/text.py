@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from rille.datasets.inspection import Findings, FoundCalibration, FoundImages
+from rille.datasets.inspection.calibration import FoundCalibration
+from rille.datasets.inspection.folder import Findings
+from rille.datasets.inspection.views import FoundImages
 from rille.datasets.manifest.rig import LONGEST_BASELINE
 from rille.datasets.text.names import derived_name
 from rille.stages.core.quantities import count, some

@@ -158,7 +158,6 @@ class Graph:
     cut : the wanted part; None: all.
     needed : numbers of the nodes that a cut graph computes, as far as it is known.
     outdated : numbers of nodes of a calibration that has been corrected since; one that is laid out again counts again.
-    unfinished : number of flows that wait: a plan that ends with some does not know all tasks.
     """
 
     sequence: str = ""
@@ -168,7 +167,6 @@ class Graph:
     last: Callable[[], None] | None = None
     cut: Cut | None = None
     needed: set[int] = field(default_factory=set)
-    unfinished: int = 0
     outdated: set[int] = field(default_factory=set)
     _labels: dict[str, Handle] = field(default_factory=dict)
     _complete: set[str] = field(default_factory=set)
@@ -223,7 +221,6 @@ class Graph:
         It yields a handle, a list of handles, or :class:`Maybe`, and gets a reference, or a list of references. If a
         task has failed, ``MissingError`` is raised in it. It does not wait after it yields :class:`Complete`.
         """
-        self.unfinished += 1
         self._go_on(steps, lambda: next(steps))
 
     def _go_on(self, steps: Generator[Wait, Any, None], step: Callable[[], Wait]) -> None:
@@ -236,12 +233,10 @@ class Graph:
         except StopIteration:
             wanted = None
         except MissingError as error:
-            self.unfinished -= 1
             # The flow never goes on; the end of the run names the tasks that it waited for.
             self.waiting.append(Waiting(error.handles, lambda *_: None, holes=False))
             return
         if wanted is None:
-            self.unfinished -= 1
             return
         one, maybe = isinstance(wanted, Handle), isinstance(wanted, Maybe)
         several = wanted.handles if isinstance(wanted, Maybe) else wanted

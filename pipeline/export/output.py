@@ -83,7 +83,7 @@ class _Unkept(Mapping[str, AnyArray]):
         self._bundle = bundle
 
     def __getitem__(self, name: str) -> AnyArray:
-        return self._bundle.part(name, ())
+        return np.asarray(self._bundle.raster(name)[()])
 
     def __contains__(self, name: object) -> bool:
         return name in self._bundle.arrays

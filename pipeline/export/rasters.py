@@ -134,7 +134,7 @@ def _hazards(run: RunView) -> tuple[Lattice, Bundle]:
 
 
 def _vehicle(risk: Bundle) -> dict[str, str]:
-    return {"vehicle": json.dumps(risk.meta.get("vehicle", {}))}
+    return {"vehicle": json.dumps(risk.meta["vehicle"])}
 
 
 def _terrain(run: RunView) -> tuple[object, ...]:

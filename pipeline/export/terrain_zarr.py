@@ -101,7 +101,7 @@ def _write_output(path: Path, run: RunView) -> None:
     """Write all merged arrays, assembled from the world tiles, and the slope."""
     arrays, tiles = {}, tiles_of(run)
     for spec in merge.merge_stage.outputs:
-        if spec.dims == ("row", "col") and all(spec.name in tile.arrays for tile in tiles):
+        if spec.dims == ("row", "col"):
             lattice, values = whole(tiles, spec.name)
             arrays[spec.name] = (spec, values)
     arrays["slope"] = (SLOPE, slope_deg(arrays["elevation"][1], lattice.cell))

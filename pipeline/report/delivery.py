@@ -172,7 +172,7 @@ def _kind(label: str) -> str:
 
 def _poses(view: RunView, frames: Rows) -> Items:
     items, remedy = [], ""
-    if view.sequence.odometry is not None and "odometry" not in view.sequence.priors:
+    if view.sequence.loose_odometry:
         remedy = ": state drift and turn_deg of [odometry], and it joins them"
     lost = [r["frame"] for r in frames if not r["posed"]]
     if lost:

@@ -97,7 +97,7 @@ def _rig(scene: Scene) -> Block | None:
 def _elevation_error(scene: Scene) -> Block | None:
     """Merged elevation minus the exact one, by cell."""
     error = gather.terrain(scene.view.bundle(scene.view.products.dem_accuracy), "error")
-    if error is None or error.arrays.get("error") is None:
+    if error is None:
         return None
     factor, unit = figures.metres_or_mm(error.arrays["error"])
     values = error.arrays["error"] * factor

@@ -30,9 +30,7 @@ class WorldTerrain:
     arrays: Mapping[str, AnyArray]
 
     def at(self, name: str, xy: Floats) -> Floats:
-        """Values (n,) of an array in the cells of points (n, 2), m; NaN outside, and where there is no such array."""
-        if name not in self.arrays:
-            return np.full(len(xy), np.nan)
+        """Values (n,) of an array in the cells of points (n, 2), m; NaN outside."""
         return self.lattice.values(self.arrays[name], self.lattice.index(xy), np.nan)
 
 
@@ -102,8 +100,7 @@ class Scene:
         tiles = [b for b in map(self.view.bundle, self.view.products.world_tiles) if b is not None]
         if not tiles:
             return None
-        shown = "elevation", "elevation_std", "spread", "count", "source", "ortho"
-        names = [name for name in shown if all(name in tile.arrays for tile in tiles)]
+        names = "elevation", "elevation_std", "spread", "count", "source", "ortho"
         lattice = union(Lattice.from_dict(tile.meta["lattice"]) for tile in tiles)
         return WorldTerrain(lattice, {name: whole(tiles, name)[1] for name in names})
 
@@ -168,10 +165,9 @@ def vertices(path: Bundle | None) -> Floats | None:
 
 def terrain(bundle: Bundle | None, *names: str) -> WorldTerrain | None:
     """Arrays of one artifact with a lattice."""
-    if bundle is None or "lattice" not in bundle.meta:
+    if bundle is None:
         return None
-    arrays = {name: np.asarray(bundle[name]) for name in names if name in bundle.arrays}
-    return WorldTerrain(Lattice.from_dict(bundle.meta["lattice"]), arrays)
+    return WorldTerrain(Lattice.from_dict(bundle.meta["lattice"]), {name: np.asarray(bundle[name]) for name in names})
 
 
 def stops(view: RunView) -> list[Stop]:

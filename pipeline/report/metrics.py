@@ -238,7 +238,7 @@ def _matching(pairs: Rows) -> dict[str, Metric]:
 
 def _terrain(scene: Scene) -> dict[str, Metric]:
     world = scene.world
-    if world is None or world.arrays.get("elevation") is None:
+    if world is None:
         return {}
     there, cell = np.isfinite(world.arrays["elevation"]), world.lattice.cell
     of_map = f"{there.mean():.0%} of the map's cells"
@@ -246,8 +246,8 @@ def _terrain(scene: Scene) -> dict[str, Metric]:
         "cell_size": metric("Cell size", cell, "m", "from the rig, or given (locus.cell_size)"),
         "mapped_area": metric("Mapped area", float(there.sum()) * cell**2, "m²", "cells with an elevation", of_map),
     }
-    sigma = world.arrays.get("elevation_std")
-    if sigma is not None and np.isfinite(sigma).any():
+    sigma = world.arrays["elevation_std"]
+    if np.isfinite(sigma).any():
         value = float(np.nanmedian(sigma))
         by_name["elevation_sigma"] = metric("Predicted σ of elevation, median", value, "m", SIGMA + "cells", of_map)
     return by_name

@@ -18,7 +18,6 @@ from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.pipeline.report.metrics import metric, metrics
-from rille.stages.core.declare import Bundle
 from rille.stages.core.quantities import count, metres, number, quantity
 from rille.stages.evaluation import imu_check
 from rille.stages.facts.terrain import GroundFacts
@@ -116,7 +115,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         bad = frames_of(view, compared.flagged)
         share = f"{len(bad)} of {len(view.frames)} frames"
         lines.append(f"trajectory and COLMAP disagree more than elsewhere at {share}: {delivery.frame_words(bad)}")
-    lines += _unlike(figures) + (_resting(view.bundle(p.trajectory)) or _to_and_fro(view.bundle(p.trajectory)))
+    lines += _unlike(figures)
     # A name in the data may hold line feeds, and a warning is one line.
     return list(dict.fromkeys(" ".join(str(line).split()) for line in lines))
 
@@ -165,46 +164,6 @@ def _unlike(figures: Mapping[str, Any]) -> list[str]:
     rmse, length = (metres(_value(figures, name)) for name in ("agreement_rmse", "agreement_length"))
     text = f"trajectory and COLMAP are unlike throughout: {rmse} RMS over {length}; one is wrong"
     return [f"{text}: do shadows or things in view move, or does the ground repeat?"]
-
-
-def _resting(trajectory: Bundle | None) -> list[str]:
-    """By the images the camera stands still, which who recorded them knows better."""
-    poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
-    rows = np.flatnonzero(rigid.posed(poses))
-    if trajectory is None or len(rows) < 3:
-        return []
-    moved = rigid.relative_error(poses[rows[:1]], poses[rows[1:]])
-    covariance = np.asarray(trajectory["covariance"])[rows[1:]]
-    for value, part in ((np.linalg.norm(moved[:, :, 3], axis=1), slice(3)), (rigid.angle(moved), slice(3, 6))):
-        # 5.0: standard deviations that a camera at rest stays within; the slowest of those that moved went 60.
-        if not (value**2 <= 5.0**2 * np.trace(covariance[:, part, part], axis1=1, axis2=2)).all():
-            return []
-    far = metres(float(np.linalg.norm(moved[:, :, 3], axis=1).max()))
-    return [
-        f"by the images the camera stands still, within {far} in all {len(rows)} frames; if it moved, what they show "
-        "moves with it or repeats along its way: switch off a projector of dots, mask the vehicle's body or the pattern"
-    ]
-
-
-def _to_and_fro(trajectory: Bundle | None) -> list[str]:
-    """The camera goes back at most of its frames, as where images are not in the order in which they were taken."""
-    poses = np.zeros((0, 3, 4)) if trajectory is None else world_poses(trajectory)
-    places = poses[rigid.posed(poses)][:, :, 3]
-    steps = np.diff(places, axis=0)
-    if len(steps) < 6:
-        return []
-    back = np.einsum("ni,ni->n", steps[1:], steps[:-1]) < 0
-    axis = np.linalg.svd(places - places.mean(axis=0))[2][0]
-    long, least = (
-        np.linalg.norm(of, axis=1).sum() for of in (steps, np.diff(places[np.argsort(places @ axis)], axis=0))
-    )
-    # 0.7: noise of a camera that rests for a while adds less to its way.
-    if back.mean() <= 0.5 or least > 0.7 * long:
-        return []
-    return [
-        f"the camera goes back at {int(back.sum())} of {len(back)} frames: {metres(long)}, where its places lie on a "
-        f"way of {metres(least)}; are the images in the order in which they were taken?"
-    ]
 
 
 def _value(figures: Mapping[str, Any], name: str) -> Any:
@@ -456,7 +415,7 @@ def _reads(run: RunView) -> tuple[object, ...]:
         *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
         *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
         *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
-        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes, s.odometry, s.priors),
+        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes, s.loose_odometry),
     )
 
 

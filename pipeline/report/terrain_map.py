@@ -49,17 +49,17 @@ def data(scene: Scene) -> dict[str, Any] | None:
     (p_hazard, slope, 0). ``track`` (frame): number, x, y, z, sigma, error or null. All lengths are metres, world frame.
     """
     world, vehicle = scene.world, scene.view.config.vehicle
-    if world is None or world.arrays.get("elevation") is None or not np.isfinite(world.arrays["elevation"]).any():
+    if world is None or not np.isfinite(world.arrays["elevation"]).any():
         return None
     step = max(1, math.ceil(math.sqrt(world.arrays["elevation"].size / MAX_CELLS)))
     z = world.arrays["elevation"][::step, ::step]
     low, high = float(np.nanmin(z)), float(np.nanmax(z))
     # Two bytes a height; 0 is undefined.
     height = _steps(z, low, max(high - low, 1e-9), np.uint16)
-    sigma, sigmas = _ratios(_plane(world, "elevation_std", step))
+    sigma, sigmas = _ratios(world.arrays["elevation_std"][::step, ::step])
     risk, reason, p_hazard = (_of_risk(scene.risk, world, name, missing)[::step, ::step] for name, missing in _RISK)
     # The class takes two bits of its byte: six are left for the number of models.
-    count = np.minimum(np.nan_to_num(_plane(world, "count", step)), 63).astype(np.uint8)
+    count = np.minimum(np.nan_to_num(world.arrays["count"][::step, ::step]), 63).astype(np.uint8)
     slope = _steps(slope_deg(world.arrays["elevation"], world.lattice.cell)[::step, ::step], 0.0, 90.0, np.uint8)
     bits = np.asarray(reason, np.uint16)
     return {
@@ -93,14 +93,9 @@ def data(scene: Scene) -> dict[str, Any] | None:
 _RISK = (("risk", UNKNOWN), ("reason", 0), ("p_hazard", np.nan))
 
 
-def _plane(world: WorldTerrain, name: str, step: int) -> Floats:
-    values = world.arrays.get(name)
-    return np.full_like(world.arrays["elevation"], np.nan)[::step, ::step] if values is None else values[::step, ::step]
-
-
 def _of_risk(risk: WorldTerrain | None, world: WorldTerrain, name: str, missing: float) -> Floats:
     """An array of the risk map on the cells of the terrain."""
-    judged = [] if risk is None or name not in risk.arrays else [(risk.lattice, risk.arrays[name])]
+    judged = [] if risk is None else [(risk.lattice, risk.arrays[name])]
     return mosaic(judged, missing, world.lattice)
 
 
@@ -130,8 +125,8 @@ def _picture(*planes: NDArray[Any]) -> str:
 
 def _ortho(scene: Scene, world: WorldTerrain, step: int) -> str:
     """The ortho image, grey or coloured, as a picture with loss."""
-    look = _plane(world, "ortho", step)
-    if {"ortho", "source"} <= world.arrays.keys() and colour.coloured(scene.view, world.arrays["source"]):
+    look = world.arrays["ortho"][::step, ::step]
+    if colour.coloured(scene.view, world.arrays["source"]):
         rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
         look = np.where(rgb > 0, rgb, np.nan)
     low, high = ranges.limits(look, 0.5, 99.5)

@@ -41,6 +41,7 @@ from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError, warning, within
+from rille.stages.odometry.resection.trajectory import trajectory_stage
 
 
 def choose_frames(text: str | None, count: int) -> tuple[int, ...]:
@@ -178,9 +179,10 @@ def perform(
     remember()
     report = _write(opened, result, made)
     _point_latest(opened.folder)
-    products, outdated = opened.view.products, opened.graph.outdated
-    # What the trajectory lacked before it was adjusted is no matter.
-    valid = (h for h in opened.graph.nodes if h.index not in outdated and h is not products.chained)
+    last, outdated = opened.view.products.trajectory, opened.graph.outdated
+    # What the trajectory lacked before it was adjusted, or driven to its end, is no matter.
+    current = (h for h in opened.graph.nodes if h.stage != trajectory_stage.name or h is last)
+    valid = (h for h in current if h.index not in outdated)
     suspicious = (line for h in valid if h.ref is not None for line in h.ref.meta.get("warnings", ()))
     for line in unsaid((*suspicious, *report["warnings"]), report["missing"], opened.view.sequence.warnings):
         warn(line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.geometry.geometry import Rig
-from rille.stages.geometry.sides import exchanged, fits
+from rille.stages.geometry.sides import exchanged, fits_turned
 from rille.stages.imaging.features import matched_points
 
 
@@ -16,5 +16,5 @@ def swap_check_stage(params: NoParams, left: Bundle, right: Bundle, *, frame: in
     facts: SwapFacts = {"frame": frame, "swapped": False}
     if len(a) >= 50:
         facts["swapped"], facts["as_given"], facts["exchanged"] = exchanged(rig, a, b)
-        facts["as_turned"] = fits(rig, a, b, turned=True)
+        facts["as_turned"] = fits_turned(rig, a, b)
     return Bundle({}, facts)

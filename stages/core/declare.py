@@ -109,15 +109,11 @@ class Bundle(Generic[F]):
     def __getitem__(self, name: str) -> AnyArray:
         return self.arrays[name]
 
-    def part(self, name: str, window: tuple[slice, ...]) -> AnyArray:
-        """Part of an array; of an artifact only that part is read, and nothing of it is kept."""
-        # Arrays in memory have no such method; those of an artifact read the chunks of the window alone.
-        read = getattr(self.arrays, "part", None)
-        found: AnyArray = self.arrays[name][window] if read is None else read(name, window)
-        return found
-
     def raster(self, name: str) -> Any:
-        """The array as something with ``shape`` that is read by window, ``raster[rows, columns]`` (slices)."""
+        """The array as something with ``shape`` that is read by window, ``raster[rows, columns]`` (slices).
+
+        Of an artifact only the chunks of the window are read, and nothing of them is kept.
+        """
         opened = getattr(self.arrays, "raster", None)
         return self.arrays[name] if opened is None else opened(name)
 

@@ -23,22 +23,16 @@ import numpy as np
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
+from rille.stages.evaluation.claims import CLAIMS, nees, truth_covariance
 from rille.stages.evaluation.reading.clock import TruePositions, late_truth
 from rille.stages.evaluation.reading.conventions import better_reading
 from rille.stages.evaluation.reading.hand_eye import hand_eye, misplaced, without_it
 from rille.stages.facts.evaluation import AccuracyFacts, Metric, metric
 from rille.stages.facts.odometry import TrajectoryFacts
 from rille.stages.geometry import rigid
-from rille.stages.geometry.geometry import RigidTransform, cross_matrix, rotation_log
+from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.rigid import posed, rms
 from rille.stages.odometry.resection.trajectory import world_poses
-
-CLAIMS = (
-    ("nees", slice(0, 6), ""),
-    ("nees_position", slice(0, 3), ", of positions alone"),
-    ("nees_rotation", slice(3, 6), ", of rotations alone"),
-)
-"""Figures of the covariances: name, rows of the covariance that are judged, description."""
 
 
 class TruthSource(NamedTuple):
@@ -98,7 +92,7 @@ def trajectory_accuracy(
         how = "squared error over the claimed one per degree of freedom, mean over frames (NEES); 1 is right"
         if sigma_m or sigma_rad:
             how += f"; with {sigma_m:g} m and {math.degrees(sigma_rad):g} degrees of the truth itself"
-        total = covariance + _truth_covariance(estimate[:, :, 3] - estimate[start, :, 3], sigma_m, sigma_rad)
+        total = covariance + truth_covariance(estimate[:, :, 3] - estimate[start, :, 3], sigma_m, sigma_rad)
         values = nees(estimate, aligned, total)
         figures |= {name: metric(values[name], "", how + whose) for name, _, whose in CLAIMS}
     return {"position": estimate[:, :, 3].copy(), "position_truth": aligned[:, :, 3].copy()}, figures
@@ -160,40 +154,6 @@ def _scale(P: Floats, Q: Floats) -> dict[str, Metric]:
         f"estimated over true length of the motions, +- {100.0 * sigma:.2g}; hangs on baseline, toe-in and focal length"
     )
     return {"scale_error": metric(100.0 * (scale - 1.0), "%", how)}
-
-
-def _truth_covariance(away: Floats, sigma_m: float, sigma_rad: float) -> Floats:
-    """Covariances (n, 6, 6) of (position m, rotation rad) of true poses that lie ``away`` (n, 3), m, from the first.
-
-    The first was made equal to the estimate. Each has its own errors; those of the first also shift all others, and
-    turn them about it.
-    """
-    own, moved = np.diag(np.repeat(np.square([sigma_m, sigma_rad]), 3)), np.tile(np.eye(6), (len(away), 1, 1))
-    moved[:, :3, 3:] = -cross_matrix(away)
-    return own + moved @ own @ np.swapaxes(moved, 1, 2)
-
-
-def nees(P: Floats, aligned: Floats, covariance: Floats) -> Mapping[str, float | str]:
-    """Mean squared errors over the claimed ones, per degree of freedom, by the names of :data:`CLAIMS`; or the reason
-    why there are none.
-
-    ``covariance`` (n, 6, 6) of (position m, rotation rad) in the world whose origin is the first posed frame, which is
-    exact: ``aligned`` is the truth with the first poses made equal.
-    """
-    names = [name for name, *_ in CLAIMS]
-    claimed = posed(P) & posed(covariance)
-    known = claimed & posed(aligned)
-    # The first frame is exact by definition and has no covariance to judge.
-    rows = np.flatnonzero(known)[1:]
-    if len(rows) == 0 or not known[np.argmax(claimed)]:
-        why = "no truth of the first posed frame, where the covariances begin, and of later ones"
-        return dict.fromkeys(names, f"{why}: --frames may begin with one that has truth")
-    if not (np.linalg.eigvalsh(covariance[rows])[:, 0] > 0).all():
-        return dict.fromkeys(names, "a covariance is singular")
-    turn = rotation_log(aligned[rows, :, :3] @ np.swapaxes(P[rows, :, :3], 1, 2))
-    error, claim = np.concatenate([aligned[rows, :, 3] - P[rows, :, 3], turn], axis=1)[..., None], covariance[rows]
-    parts = {name: (error[:, part], claim[:, part, part]) for name, part, _ in CLAIMS}
-    return {name: float(np.mean(e * np.linalg.solve(c, e))) for name, (e, c) in parts.items()}
 
 
 def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:

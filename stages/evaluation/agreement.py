@@ -190,12 +190,12 @@ def agreement_stage(
     theirs, numbers, lines = (
         rigid.by_frame(np.asarray(crosscheck[name]), given, frames) for name in ("poses", "piece", "line_distance")
     )
-    own = np.asarray(trajectory.arrays.get("piece", np.zeros(len(frames))), np.int64)
+    own = np.asarray(trajectory["piece"], np.int64)
     piece = unbroken(np.nan_to_num(numbers, nan=-1).astype(np.int64), own)
     arrays, scale, scaled = compare(ours, theirs, piece)
     arrays["line_distance"] = lines
     # Without errors of the calibration, which both share.
-    stated = np.asarray(trajectory.arrays.get("own_covariance", np.zeros((len(frames), 6, 6))), np.float64)
+    stated = np.asarray(trajectory["own_covariance"], np.float64)
     flags, limits = flag(arrays, expected(stated, own))
     compared = np.isfinite(arrays["distance"])
     # Each of our pieces has its own frame of reference: no path leads from one to the next.

@@ -15,8 +15,9 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Bundle, NoParams, raster, stage
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.claims import claims_held
 from rille.stages.evaluation.dem_comparison import figures
-from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric, within
+from rille.stages.facts.evaluation import DemAccuracyFacts, Metric, metric
 from rille.stages.geometry.lattice import Lattice, mosaic
 
 ERRORS: Mapping[str, str] = {
@@ -43,7 +44,7 @@ def dem_accuracy(elevation: Floats32, std: Floats32, truth: Floats32, judged: Bo
     return {
         **{name: metric(error.get(name), "m", f"{what}, {how}") for name, what in ERRORS.items()},
         "completeness": metric(error["cells"] / wanted if wanted else None, "1", f"share given: {how}"),
-        **within(np.abs(errors[given]), std[judged][given], f"of the elevation, {how}"),
+        **claims_held(np.abs(errors[given]), std[judged][given], f"of the elevation, {how}"),
     }
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from rille.stages.core.arrays import Bools, Floats32
 from rille.stages.core.declare import Array, Bundle, NoParams, stage
 from rille.stages.core.validity import matched
-from rille.stages.facts.evaluation import Metric, MetricsFacts, metric, within
+from rille.stages.evaluation.claims import claims_held
+from rille.stages.facts.evaluation import Metric, MetricsFacts, metric
 from rille.stages.facts.matching import DisparityFacts
 
 
@@ -63,7 +64,7 @@ def disparity_accuracy(column: Floats32, match: Bools, sigma: Floats32, truth: F
         figures[f"bad_{limit}"] = metric(worse, "1", words + of_all)
         worse = float(np.mean(error > limit)) if error.size else None
         figures[f"bad_{limit}_matched"] = metric(worse, "1", words + of_matched)
-    return figures | within(error, sigma[both], f"of the disparity, {of_matched}")
+    return figures | claims_held(error, sigma[both], f"of the disparity, {of_matched}")
 
 
 @stage(

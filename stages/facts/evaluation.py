@@ -3,9 +3,7 @@
 import math
 from typing import Any
 
-import numpy as np
-
-from rille.stages.core.declare import AnyArray, Facts
+from rille.stages.core.declare import Facts
 
 Metric = dict[str, Any]
 """Value, unit, and how it was measured."""
@@ -22,19 +20,6 @@ def metric(value: Value, unit: str, how: str) -> Metric:
     if isinstance(value, str):
         return {"value": None, "unit": unit, "how": f"not applicable: {value}"}
     return {"value": value if value is not None and math.isfinite(value) else None, "unit": unit, "how": how}
-
-
-def within(error: AnyArray, std: AnyArray, what: str) -> dict[str, Metric]:
-    """Shares of the errors (n,) up to one and two ``std`` (n,), in the same unit; ``what`` was measured, in words.
-
-    Of normally distributed errors 68 and 95 %.
-    """
-    return {
-        f"within_{count}_sigma": metric(
-            float(np.mean(error <= count * std)) if error.size else None, "1", f"share within {deviations} {what}"
-        )
-        for count, deviations in ((1, "1 standard deviation"), (2, "2 standard deviations"))
-    }
 
 
 class MetricsFacts(Facts):

@@ -131,12 +131,8 @@ class TrajectoryFacts(Facts):
     pieces: list[list[int]]
     """Frames of each."""
     main: int
-    lost: list[dict[str, Any]]
-    """Frame, cause, and the frames between which it is bridged."""
-    breaks: list[dict[str, Any]]
-    """First frame of a piece, and why it is not of the piece before, where that is known."""
-    unlike_verticals: list[str]
-    """Warnings of pairs whose ground contradicts the vertical of their piece."""
+    causes: dict[str, str]
+    """Why frames, by their numbers, are lost or begin a piece, where that is known."""
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
 

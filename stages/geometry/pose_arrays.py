@@ -42,6 +42,4 @@ BY_INTRINSICS = Array(
     "nan",
 )
 
-OWN_COVARIANCE = replace(
-    COVARIANCE, name="own_covariance", long_name="covariance if the calibration had no errors", optional=True
-)
+OWN_COVARIANCE = replace(COVARIANCE, name="own_covariance", long_name="covariance if the calibration had no errors")

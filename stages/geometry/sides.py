@@ -22,24 +22,32 @@ class BeyondInfinityError(DegenerateError):
     """Most matches lie beyond infinity, though the sides are not exchanged."""
 
 
-def fits(rig: Rig, left: Floats, right: Floats, *, turned: bool = False) -> float:
-    """Share of the matches (n, 2), (n, 2) in front of the cameras and on their epipolar lines.
+def fits(rig: Rig, left: Floats, right: Floats) -> float:
+    """Share of the matches (n, 2), (n, 2) in front of the cameras and on their epipolar lines."""
+    return _near(rig, left, right, line_distances(rig, left, right))
 
-    ``turned``: once the right camera is turned back about its optical and its horizontal axis, which moves rows alike,
-    and in proportion to the column.
-    """
-    tolerance = MAX_LINE_DISTANCE_PX * right_pixels(rig)
+
+def fits_turned(rig: Rig, left: Floats, right: Floats) -> float:
+    """The same share once the right camera is turned back about its optical and its horizontal axis, which moves rows
+    alike, and in proportion to the column."""
     off = line_distances(rig, left, right)
-    if turned:
-        column, line = right[:, 0] - right[:, 0].mean(), np.array([0.0, np.median(off)])
-        for _ in range(6):
-            rest = np.abs(off - np.polyval(line, column))
-            near = rest <= max(tolerance, 2.0 * float(np.median(rest)))
-            line = np.polyfit(column[near], off[near], 1)
-        off = off - np.polyval(line, column)
+    column, line = right[:, 0] - right[:, 0].mean(), np.array([0.0, np.median(off)])
+    for _ in range(6):
+        rest = np.abs(off - np.polyval(line, column))
+        near = rest <= max(_tolerance(rig), 2.0 * float(np.median(rest)))
+        line = np.polyfit(column[near], off[near], 1)
+    return _near(rig, left, right, off - np.polyval(line, column))
+
+
+def _near(rig: Rig, left: Floats, right: Floats, off: Floats) -> float:
+    """Share of the matches that are in front of the cameras, and less than the tolerance ``off`` (n,) their lines."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = beyond_infinity(rig, left, right) < 0.5 * tolerance
-    return float(np.mean((np.abs(off) < tolerance) & ahead))
+        ahead = beyond_infinity(rig, left, right) < 0.5 * _tolerance(rig)
+    return float(np.mean((np.abs(off) < _tolerance(rig)) & ahead))
+
+
+def _tolerance(rig: Rig) -> float:
+    return MAX_LINE_DISTANCE_PX * right_pixels(rig)
 
 
 def exchanged(rig: Rig, left: Floats, right: Floats) -> tuple[bool, float, float]:

@@ -37,7 +37,7 @@ def greatest_move(before: RigidTransform, after: RigidTransform, local: DemFacts
     version=3,
     outputs=[
         replace(POSES, frame="world", nodata=""),
-        replace(COVARIANCE, frame="world", nodata="", optional=True),
+        replace(COVARIANCE, frame="world", nodata=""),
     ],
 )
 def pose_stage(
@@ -56,10 +56,6 @@ def pose_stage(
         before, after = (RigidTransform.from_matrix(one["poses"][row]) for one in (chained, trajectory))
         # A model may lie a quarter of a cell off its adjusted place.
         used = chained if greatest_move(before, after, local.meta) <= 0.25 else trajectory
-    arrays = {name: used[name][row : row + 1].copy() for name in ("poses", "covariance") if name in used.arrays}
-    # How the calibration acts on another trajectory than that of the segments is not known.
-    if "own_covariance" in used.arrays:
-        vertical = used.meta["verticals"][int(used["piece"][row])]
-        if vertical in (GROUND_PLANE, REFERENCE_PLANE):
-            arrays["covariance"] = used["own_covariance"][row : row + 1].copy()
-    return Bundle(arrays, {})
+    own = used.meta["verticals"][int(used["piece"][row])] in (GROUND_PLANE, REFERENCE_PLANE)
+    arrays = {"poses": used["poses"], "covariance": used["own_covariance" if own else "covariance"]}
+    return Bundle({name: array[row : row + 1].copy() for name, array in arrays.items()}, {})

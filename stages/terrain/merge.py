@@ -296,7 +296,7 @@ def _fine(dem: Bundle, lattice: Lattice, most: float | None) -> Callable[[str, W
     """Parts of a model, elevations by :func:`seen_finely`."""
 
     def part(name: str, window: Window) -> Any:
-        values = np.asarray(dem.part(name, window))
+        values = np.asarray(dem.raster(name)[window])
         if name != "elevation":
             return values
         return seen_finely(values, lattice.xs()[window[1]], lattice.ys()[window[0]], dem.meta, most)

@@ -69,7 +69,7 @@ def seam(dem: Bundle, own: Mapping[str, Floats32], other: Bundle) -> dict[str, A
     if common is None:
         return None
     windows = [lattice.window(common) for lattice in lattices]
-    shared = {name: (own[name][windows[0]], np.asarray(other.part(name, windows[1]))) for name in ARRAYS}
+    shared = {name: (own[name][windows[0]], np.asarray(other.raster(name)[windows[1]])) for name in ARRAYS}
     known = np.isfinite(shared["elevation"][0]) & np.isfinite(shared["elevation"][1])
     step = max(1, math.ceil(math.sqrt(np.count_nonzero(known) / MAX_CELLS)))
     each = np.s_[::step, ::step]

@@ -20,7 +20,7 @@ from folders import CAMERAS, RIG, write_images
 
 from rille.datasets.cameras import read_cameras, rig_of
 from rille.datasets.images import files
-from rille.datasets.inspection import inspect
+from rille.datasets.inspection.folder import inspect
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml

@@ -18,7 +18,7 @@ from raising import raises
 
 from rille.datasets.georeference import Georeference
 from rille.datasets.images.files import Digests
-from rille.datasets.inspection import inspect
+from rille.datasets.inspection.folder import inspect
 from rille.datasets.manifest import model
 from rille.datasets.manifest.model import Manifest, read_manifest
 from rille.datasets.manifest.opening import dotted, open_manifest

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from raising import raises
 from scipy.spatial.transform import Rotation
 
-from rille.datasets.inspection import table_kind
+from rille.datasets.inspection.tables import table_kind
 from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 

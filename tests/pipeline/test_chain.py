@@ -105,7 +105,7 @@ def test_xarray_opens_the_artifact_of_every_stage_with_dimensions_and_units(cold
             continue
         opened.add(stage)
         arrays = manifest["arrays"]
-        with xarray.open_zarr(store.path(reference(manifest))) as data:
+        with xarray.open_zarr(f"zip::{store.root / reference(manifest).path}") as data:
             assert set(data.data_vars) == set(arrays), stage
             lattice = manifest["meta"].get("lattice")
             assert set(data.coords) == ({"x", "y"} if lattice else set()), stage

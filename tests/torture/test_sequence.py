@@ -107,7 +107,7 @@ def test_an_artifact_of_each_stage_opens_with_xarray_and_has_units(whole):
     made = one_of_each_stage(store)
     assert len(made) > 25
     for stage, manifest in made.items():
-        opened = xarray.open_zarr(store.path(reference(manifest)))
+        opened = xarray.open_zarr(f"zip::{store.root / reference(manifest).path}")
         assert set(opened.data_vars) == set(manifest["arrays"]), stage
         for name in opened.data_vars:
             assert opened[name].attrs["units"], (stage, name)

@@ -53,7 +53,7 @@ def plan(
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
-        if not graph.unfinished:  # else some inputs are unknown, so they belong to the unknown tasks
+        if not graph.waiting:  # else some inputs are unknown, so they belong to the unknown tasks
             run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
 
     graph.last = outputs

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from rille.datasets.bags import is_bag
 from rille.datasets.images.pairing import writable
-from rille.datasets.inspection import Findings, inspect
+from rille.datasets.inspection.folder import Findings, inspect
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import folder_manifest, hindrance
 from rille.datasets.text.names import derived_name, shell_word

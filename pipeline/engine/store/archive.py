@@ -14,9 +14,6 @@ import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
-
-from rille.datasets.text.reading import mark
 
 MANIFEST = "manifest.json"
 
@@ -51,14 +48,8 @@ class Archive(zipfile.ZipFile):
     """An artifact's file, open for reading; ``size`` is that of the file, bytes."""
 
     def __init__(self, file: _RegularFile) -> None:
-        self._file = file
         super().__init__(file)
         self.size = os.fstat(file.fileno()).st_size
-
-    def close(self) -> None:
-        """Close the archive and its file."""
-        super().close()
-        self._file.close()
 
     def member(self, name: str, most: int) -> bytes:
         """Content of a member of at most ``most`` bytes.
@@ -98,8 +89,8 @@ def opened(path: str) -> Iterator[Archive]:
     FileNotFoundError
         There is none.
     """
-    with _broken():
-        yield _kept(path, mark(os.stat(path)))
+    with _broken(), _RegularFile(path) as file, Archive(file) as archive:
+        yield archive
 
 
 @contextmanager
@@ -114,10 +105,3 @@ def _broken() -> Iterator[None]:
         if error.errno not in (errno.EINVAL, errno.EISDIR):
             raise
         raise BrokenError(os.strerror(error.errno)) from None
-
-
-# Arrays are read one by one, and opening reads the directory.
-@lru_cache(32)
-def _kept(path: str, marked: str) -> Archive:
-    """The archive at a path while the file's mark stays the same; it is closed when nobody refers to it."""
-    return Archive(_RegularFile(path))

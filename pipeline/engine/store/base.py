@@ -130,10 +130,6 @@ class Store:
         with folder.clear_errors(self.root), archive.opened(f"{self.root}/{artifact_path(stage, key)}") as file:
             yield file
 
-    def path(self, ref: Ref) -> str:
-        """Return the address by which ``xarray.open_zarr`` opens an artifact."""
-        return f"zip::{self.root / ref.path}"
-
     def open(self, ref: Ref) -> Bundle:
         """The bundle behind a reference; each array is read, and its chunks' checksums compared, at first access.
 

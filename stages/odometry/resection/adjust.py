@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -148,7 +148,7 @@ def adjust_stage(
 ) -> Bundle[TrajectoryFacts]:
     """Poses of all left frames, adjusted to places seen again and to what other sensors say."""
     frames = trajectory.meta["frames"]
-    out = Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
+    out = Chained.of(trajectory)
     posed = np.flatnonzero(out.piece >= 0)
     row = {frames[k]: node for node, k in enumerate(posed)}
     numbers = [[int(f["frame"]) for f in bundle.meta["per_frame"]] for bundle in segments]
@@ -233,14 +233,15 @@ def _bundle(
 ) -> Bundle[TrajectoryFacts]:
     """Arrays and facts as of stage ``trajectory``."""
     kept, out.piece[out.piece >= 0] = np.unique(out.piece[out.piece >= 0], return_inverse=True)
-    frames = before.meta["frames"]
-    verticals = [before.meta["verticals"][k] for k in kept]
-    causes = {int(one["frame"]): one["cause"] for one in (*before.meta["lost"], *before.meta["breaks"])}
-    facts = account(frames, out, causes, verticals)
+    chained, causes = before.meta, {int(frame): cause for frame, cause in before.meta["causes"].items()}
+    facts = account(chained["frames"], out, causes, [chained["verticals"][k] for k in kept])
+    # What the chain lacked or seemed to do is judged anew; other lines on it hold.
+    told = account(chained["frames"], Chained.of(before), causes, chained["verticals"])["warnings"]
+    others = [line for line in chained["warnings"] if line not in told]
     meta: TrajectoryFacts = {
-        **before.meta,
+        **chained,
         **facts,  # type: ignore[typeddict-item]
         **more,
-        "warnings": [*facts["warnings"], *before.meta["unlike_verticals"], *lines],
+        "warnings": [*facts["warnings"], *others, *lines],
     }
     return Bundle(vars(out), meta)

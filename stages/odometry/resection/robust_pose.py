@@ -184,32 +184,29 @@ def _adjusted(obs: Observations, active: Bools, start: Pose, params: ResectParam
 
 
 def sampled_pose(
-    pixels: Floats, landmarks: Floats, camera: Mapping[str, Any], bound: float, seed: int, focal_length: bool = False
-) -> tuple[Mapping[str, Any], float] | None:
+    pixels: Floats, landmarks: Floats, camera: Any, bound: float, seed: int, *, focal_length: bool = False
+) -> Mapping[str, Any] | None:
     """COLMAP's pose by random samples that most landmarks (n, 3) are within ``bound`` pixels of; None: of too few.
 
-    ``camera`` has COLMAP's ``model``, ``width``, ``height`` and ``params``. With the pose goes the focal length, which
-    ``focal_length`` finds as well.
+    ``camera`` is COLMAP's; ``focal_length``: find its focal length as well, and set it.
     """
     # Here: the client, which only needs the stages' declarations, is spared its memory.
     from rille.stages.geometry.colmap import pycolmap
 
-    pinhole = pycolmap.Camera(**camera)
     options = pycolmap.AbsolutePoseEstimationOptions(estimate_focal_length=focal_length)
     options.ransac.max_error, options.ransac.random_seed = bound, seed % 2**31
-    found: Mapping[str, Any] | None = pycolmap.estimate_absolute_pose(pixels, landmarks, pinhole, options)
-    return None if found is None else (found, pinhole.focal_length_x)
+    found: Mapping[str, Any] | None = pycolmap.estimate_absolute_pose(pixels, landmarks, camera, options)
+    return found
 
 
 def _sampled(obs: Observations, bound: float, frame: int) -> list[Pose]:
     """The pose of random samples, if there is one."""
+    from rille.stages.geometry.colmap import pycolmap
+
     # The size plays no part, but must be there.
-    camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": list(Pinhole.of(obs.camera))}
-    answer = sampled_pose(obs.pixels, obs.landmarks.position, camera, bound, 1999 * 100_003 + frame)
-    if answer is None:
-        return []
-    found, _ = answer
-    return [Pose.of(RigidTransform.from_matrix(found["cam_from_world"].matrix()))]
+    camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=list(Pinhole.of(obs.camera)))
+    found = sampled_pose(obs.pixels, obs.landmarks.position, camera, bound, 1999 * 100_003 + frame)
+    return [] if found is None else [Pose.of(RigidTransform.from_matrix(found["cam_from_world"].matrix()))]
 
 
 def _without_inconsistent(

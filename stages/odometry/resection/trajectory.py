@@ -24,8 +24,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import groupby, pairwise
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ from rille.stages.facts.odometry import IntrinsicsFacts, ResectFacts, Trajectory
 from rille.stages.facts.terrain import GroundFacts
 from rille.stages.geometry.geometry import RigidTransform, cross_matrix, level_rotation, orthonormal, rotation_exp
 from rille.stages.geometry.pose_arrays import COVARIANCE, GROUND_PLANE, NO_VERTICAL, OWN_COVARIANCE, POSES
+from rille.stages.odometry.doubtful_motion import doubtful_motion
 
 
 class ChainLink(NamedTuple):
@@ -80,6 +82,11 @@ class Chained:
     own_covariance: Floats
     segment: NDArray[np.int16]
     piece: NDArray[np.int16]
+
+    @staticmethod
+    def of(trajectory: Bundle[TrajectoryFacts]) -> Chained:
+        """A copy of those of a trajectory."""
+        return Chained(**{field.name: np.array(trajectory[field.name]) for field in fields(Chained)})
 
     @staticmethod
     def unposed(frames: int) -> Chained:
@@ -158,11 +165,8 @@ def propagation(key: RigidTransform, T_world_local: RigidTransform, world: Rigid
 
 def world_poses(trajectory: Bundle, piece: int | None = None) -> Floats:
     """Poses (frame, 3, 4) of the piece whose frame is the world, or of another one in its own; NaN elsewhere."""
-    poses = np.asarray(trajectory["poses"], dtype=np.float64)
-    if "piece" not in trajectory.arrays:
-        return poses
-    wanted = trajectory.meta.get("main", 0) if piece is None else piece
-    return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], poses, np.nan)
+    wanted = trajectory.meta["main"] if piece is None else piece
+    return np.where((np.asarray(trajectory["piece"]) == wanted)[:, None, None], trajectory["poses"], np.nan)
 
 
 def _level(found: Chained, piece: int, up: Floats) -> None:
@@ -218,54 +222,51 @@ def _unlike_verticals(
 
 
 def account(frames: list[int], found: Chained, causes: Mapping[int, str], verticals: Sequence[str]) -> dict[str, Any]:
-    """Facts of a trajectory, and lines on what is missing.
+    """Facts of a trajectory, and lines on what it lacks and on its motion.
 
-    Positions, pieces with their ``verticals``, how many frames have a pose and how many in the world, and lost frames
-    with their ``causes``.
+    Positions, pieces with their ``verticals``, and the ``causes`` of frames that are lost or begin a piece.
     """
     piece = found.piece
     main = int(np.argmax(np.bincount(piece[piece >= 0], minlength=1)))  # the first of the largest
-    posed, lost = np.flatnonzero(piece >= 0), list[dict[str, Any]]()
     members = [np.flatnonzero(piece == k) for k in range(int(piece.max()) + 1)]
-    for row in np.flatnonzero(piece < 0):
-        behind = int(np.searchsorted(posed, row))
-        sides = posed[behind - 1 : behind + 1] if behind else posed[:0]
-        # Bridged: the frames on both sides are of one piece, tracked across.
-        bridged = [frames[k] for k in sides] if len(sides) == 2 and piece[sides[0]] == piece[sides[1]] else None
-        cause = causes.get(frames[row], "no frame beside it could be posed with it")
-        lost.append({"frame": frames[row], "cause": cause, "bridged": bridged})
+    begun = [frames[k] for k in (*np.flatnonzero(piece < 0), *(rows[0] for rows in members[1:]))]
     facts = {
         # Facts are JSON, which has no NaN.
         "positions": [[float(v) for v in p[:, 3]] if np.isfinite(p).all() else None for p in found.poses],
         "verticals": list(verticals),
         "pieces": [[frames[k] for k in rows] for rows in members],
         "main": main,
-        "lost": lost,
-        "breaks": [{"frame": k, "cause": causes[k]} for k in (frames[rows[0]] for rows in members[1:]) if k in causes],
+        "causes": {str(frame): causes[frame] for frame in begun if frame in causes},
     }
-    return facts | {"warnings": list(_missing(frames, facts, causes))}
+    motion = doubtful_motion(found.poses[members[main]], found.covariance[members[main]])
+    return facts | {"warnings": [*_lost(frames, piece, causes), *_missing(facts, causes), *motion]}
 
 
 VIEW_MOVES = "; the view moves by "
 """Behind the cause for which a frame is lost, how far its view lies from that of the frame before."""
 
 
-def _missing(frames: Sequence[int], facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:
-    """Lines on what a trajectory of some frames lacks, by the facts of :func:`account`."""
-    place = {frame: k for k, frame in enumerate(frames)}
-
-    def alike(numbered: tuple[int, dict[str, Any]]) -> tuple[int, str, Any]:
-        # Of frames that follow each other, of one cause but for how far each view moves.
-        k, one = numbered
-        return place[one["frame"]] - k, one["cause"].partition(VIEW_MOVES)[0], one["bridged"]
-
-    for (_, cause, bridged), group in groupby(enumerate(facts["lost"]), alike):
-        first, *others = (one for _, one in group)
-        how = "no pose" if bridged is None else f"bridged from {bridged[0]} to {bridged[1]}"
+def _lost(frames: Sequence[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> Iterator[str]:
+    """Lines on frames without a pose: one for those in a row that have one cause, but for how far each view moves."""
+    posed, fates = np.flatnonzero(piece >= 0), list[tuple[int, str, str]]()
+    for row in np.flatnonzero(piece < 0).tolist():
+        behind = int(np.searchsorted(posed, row))
+        sides = posed[behind - 1 : behind + 1] if behind else posed[:0]
+        # Bridged: the frames on both sides are of one piece, tracked across.
+        bridged = len(sides) == 2 and piece[sides[0]] == piece[sides[1]]
+        how = f"bridged from {frames[sides[0]]} to {frames[sides[1]]}" if bridged else "no pose"
+        fates.append((row, causes.get(frames[row], "no frame beside it could be posed with it"), how))
+    keys = [(row - k, cause.partition(VIEW_MOVES)[0], how) for k, (row, cause, how) in enumerate(fates)]
+    for (_, cause, how), group in groupby(zip(keys, fates, strict=True), itemgetter(0)):
+        (_, (row, whole, _)), *others = group
         if others:
-            yield f"frames {first['frame']}-{others[-1]['frame']} lost: {cause}; {how}"
+            yield f"frames {frames[row]}-{frames[others[-1][1][0]]} lost: {cause}; {how}"
         else:
-            yield f"frame {first['frame']} lost: {first['cause']}; {how}"
+            yield f"frame {frames[row]} lost: {whole}; {how}"
+
+
+def _missing(facts: Mapping[str, Any], causes: Mapping[int, str]) -> Iterator[str]:
+    """Lines on where a trajectory is broken, and on pieces without a vertical, by the facts of :func:`account`."""
     pieces = facts["pieces"]
     if len(pieces) > 1:
         words = ", ".join(f"piece {k}: frames {spans(piece)}" for k, piece in enumerate(pieces, start=1))
@@ -340,7 +341,6 @@ def trajectory_stage(
         "frames": frames,
         "inliers": [inliers.get(f, 0) for f in frames],
         **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
-        "unlike_verticals": list(_unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)),
     }
-    meta["warnings"] += meta["unlike_verticals"]
+    meta["warnings"] += _unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)
     return Bundle(vars(found), meta)

@@ -30,6 +30,8 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
     DegenerateError
         The focal length changed.
     """
+    from rille.stages.geometry.colmap import pycolmap
+
     count = len(pixels)
     # 0.1: share of the landmarks that contradict a pose from which on the focal length is tried: moving objects and
     # wrong tracks make up less, mostly.
@@ -39,12 +41,11 @@ def refuse_zoom(landmarks: Floats, pixels: Floats, camera: Camera, agreeing: int
     # One focal length, as the solver wants it: that of the columns.
     square = (pixels - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
     size = {"width": camera.width, "height": camera.height}
-    pinhole = {"model": "SIMPLE_PINHOLE", **size, "params": [camera.fx, 0, 0]}
-    answer = sampled_pose(square, landmarks, pinhole, bound, frame, focal_length=True)
-    if answer is None:
+    pinhole = pycolmap.Camera(model="SIMPLE_PINHOLE", **size, params=[camera.fx, 0, 0])
+    found = sampled_pose(square, landmarks, pinhole, bound, frame, focal_length=True)
+    if found is None:
         return
-    found, focal_length = answer
-    agree, larger = found["num_inliers"], focal_length / camera.fx - 1.0
+    agree, larger = found["num_inliers"], pinhole.focal_length_x / camera.fx - 1.0
     # 0.6: share of those that agree with another focal length from which on that is the cause: of a zoom by 2 % some
     # 0.8, of another vehicle or of the own body, to which a focal length adapts as well, at most 0.35.
     if agree - agreeing < 0.6 * (count - agreeing) or abs(larger) < MIN_CHANGE:

@@ -51,7 +51,7 @@ def test_a_flow_gets_what_it_yielded_and_several_run_side_by_side(tmp_path):
         graph.flow(flow)
     assert [handle.label for handle in graph.nodes] == ["numbers/0", "numbers/1", "numbers/2"], "all have begun"
     assert run(graph, tmp_path).ok
-    assert graph.unfinished == 0
+    assert not graph.waiting
     assert told == [0, 1, 2, (4, 3, [])]
 
 
@@ -81,7 +81,7 @@ def test_what_is_missing_is_none_or_raises_where_it_is_waited_for(tmp_path):
     result = run(graph, tmp_path, ledger=tmp_path / "ledger.jsonl")
     assert [failure.label for failure in result.failures] == ["broken/degenerate"]
     assert sorted(map(str, told)) == sorted(["1", "[False, True]", "broken/degenerate"])
-    assert graph.unfinished == 0
+    assert [one.handles for one in graph.waiting] == [[after]]
     assert "plan after after" in (tmp_path / "ledger.jsonl").read_text(), "the run says what never followed"
 
 

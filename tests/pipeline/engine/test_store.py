@@ -112,7 +112,7 @@ def test_round_trip_keeps_every_bit_and_the_digest(cache):
 
 def test_xarray_opens_it(cache):
     ref = commit(cache)
-    for way in (Store(cache).path(ref), zarr.storage.ZipStore(cache / ref.path, mode="r")):
+    for way in (f"zip::{cache / ref.path}", zarr.storage.ZipStore(cache / ref.path, mode="r")):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             data = xarray.open_zarr(way)
@@ -446,12 +446,12 @@ def test_of_a_window_only_the_chunks_are_read_that_it_touches(cache, monkeypatch
     opened, names = Store(cache).open(ref).arrays, []
     member = archive.Archive.member
     monkeypatch.setattr(archive.Archive, "member", lambda self, *args: names.append(args[0]) or member(self, *args))
-    part = opened.part("elevation", (slice(1000, 1040), slice(5, 9)))
+    part = opened.raster("elevation")[1000:1040, 5:9]
     np.testing.assert_array_equal(part, elevation[1000:1040, 5:9])
     assert names == ["elevation/c.0.0", "elevation/c.1.0"]
     file_of(cache).unlink()
     with raises("RIL-504", "missing"):
-        opened.part("elevation", (slice(2400, 2500), slice(1030, 1040)))
+        opened.raster("elevation")[2400:2500, 1030:1040]
 
 
 @settings(max_examples=25, deadline=None)

@@ -233,6 +233,7 @@ def test_all_files_of_a_run_state_one_system(georeference: Georeference | None, 
         "spread",
         "count",
         "source",
+        "relief_std",
     }
     local = pyproj.CRS.from_wkt(terrain.spatial_ref.attrs["crs_wkt"])
     found["terrain.zarr"] = local if georeference is None else pyproj.CRS(terrain.attrs["georeference_crs"])

@@ -32,7 +32,7 @@ def arrays() -> dict:
 
 def write(path: Path, bundle: Bundle) -> str:
     store = Store(path)
-    return store.path(store.commit(merge.merge_stage, "a" * 64, bundle))
+    return f"zip::{store.root / store.commit(merge.merge_stage, 'a' * 64, bundle).path}"
 
 
 def opened(path: Path | str) -> xarray.Dataset:

@@ -25,7 +25,7 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, summary
 from rille.stages.core.declare import Bundle
-from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams
 from rille.stages.hazard.vehicle import Vehicle
 from rille.stages.planning.path import PathParams
@@ -63,43 +63,6 @@ def test_a_crosscheck_that_is_wrong_as_a_whole_is_told(share: float | None, told
     lines = summary._unlike({f"agreement_{name}": {"value": value} for name, value in values.items()})
     assert len(lines) == told
     assert all("512 m" in line and "0.270 m" in line for line in lines)
-
-
-@pytest.mark.parametrize(("step", "turn", "told"), [(0.0, 0.0, 1), (0.01, 0.0, 0), (0.0, 0.01, 0)])
-def test_a_camera_that_stands_still_is_told_and_not_one_that_turns_on_the_spot(step, turn, told) -> None:
-    """Who recorded it knows whether it stood, or whether a projector's dots moved with it."""
-    poses = np.tile(np.eye(3, 4), (5, 1, 1))
-    poses[1:4, :, 3] = np.random.default_rng(0).normal(scale=1e-4, size=(3, 3))
-    for k, pose in enumerate(poses):
-        pose[:, :3], pose[2, 3] = rotation_exp([0.0, k * turn, 0.0]), pose[2, 3] + k * step
-    covariance = np.tile(1e-8 * np.eye(6), (5, 1, 1))
-    meta = {"frames": list(range(5)), "pieces": [list(range(5))], "main": 0}
-    arrays = {"poses": poses, "covariance": covariance, "piece": np.zeros(5, np.int16)}
-    lines = summary._resting(Bundle(arrays, meta))
-    assert len(lines) == told
-    assert all("stands still" in line and "5 frames" in line for line in lines)
-    assert summary._resting(None) == []
-
-
-@pytest.mark.parametrize(
-    ("places", "told"),
-    [
-        ([1, 0, 3, 2, 5, 4, 7, 6, 9, 8], 1),  # each two in turns
-        ([0, 5, 1, 6, 2, 7, 3, 8, 4, 9], 1),  # two halves mixed
-        (range(10), 0),
-        ([0, 1, 2, 3, 4, 5, 4, 3, 2, 1, 0], 0),
-        ([0, 0.001, 0, 0.001, 0, 0.001, 0, 1, 2, 3], 0),  # stood for a while
-    ],
-)
-def test_images_out_of_order_are_asked_for(places, told) -> None:
-    n = len(list(places))
-    poses = np.tile(np.eye(3, 4), (n, 1, 1))
-    poses[:, 2, 3] = list(places)
-    poses[:, 0, 3] = 0.01 * np.arange(n) ** 2
-    meta = {"frames": list(range(n)), "pieces": [list(range(n))], "main": 0}
-    lines = summary._to_and_fro(Bundle({"poses": poses, "piece": np.zeros(n, np.int16)}, meta))
-    assert len(lines) == told
-    assert all("in the order" in line for line in lines)
 
 
 @pytest.mark.parametrize(("angle", "told"), [(0.0025, True), (0.0005, False), (0.0, False)])

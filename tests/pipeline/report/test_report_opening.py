@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toys.finished import Page, bundles, view, written
 
+from rille.datasets.protocol import Sequence
 from rille.pipeline.export.view import UNSTATED, TaskRow
 from rille.pipeline.report import delivery, page, summary, terrain_map
 from rille.pipeline.report.gather import WorldTerrain
@@ -136,7 +137,8 @@ def test_what_the_images_contradict_is_told_before_what_failed():
 
 @pytest.mark.parametrize(("priors", "told"), [({}, True), ({"odometry": {"drift": 0.02}}, False)])
 def test_odometry_that_says_not_how_good_it_is_could_join_pieces(priors, told):
-    view = SimpleNamespace(sequence=SimpleNamespace(odometry=(), priors=priors))
+    known = SimpleNamespace(odometry=(), priors=priors)
+    view = SimpleNamespace(sequence=SimpleNamespace(loose_odometry=Sequence.loose_odometry.__get__(known)))
     (item,) = delivery._poses(view, [{"frame": k, "posed": True, "in_world": k < 2} for k in range(3)])
     assert ("state drift and turn_deg of [odometry]" in item["why"]) == told
 
@@ -146,7 +148,7 @@ def test_a_part_that_poses_frames_misses_those_that_have_no_pose(made):
     tasks = [TaskRow("trajectory" if made else "track/0", "trajectory" if made else "track", "computed")]
     given = {"tasks": tasks, "part": "--until trajectory", "left_out": {}, "until": (), "only": ()}
     rows = [{"frame": k, "posed": k != 1, "in_world": k < 2} for k in range(3)]
-    view = SimpleNamespace(**given, sequence=SimpleNamespace(odometry=None))
+    view = SimpleNamespace(**given, sequence=SimpleNamespace(loose_odometry=False))
     found = {"missing": delivery._poses(view, rows), "absent": [], "delivered": []}
     told = delivery.complete(found, view, [])["missing"]
     assert [m["why"] for m in told] == (["frame 1", "frame 2"] if made else [])

@@ -100,8 +100,11 @@ def bundles() -> dict[str, Bundle]:
     poses = np.array([level_pose(i * STEP).matrix34 for i in FRAMES])
     count = np.where(np.isfinite(z), 2, 0).astype(np.uint16)
     made = {
-        "tile": Bundle({**dem, "count": count, "spread": sigma, "source": np.zeros(z.shape, np.int32)}, lattice),
-        "risk": Bundle(bands, lattice),
+        "tile": Bundle(
+            {**dem, "count": count, "spread": sigma, "source": np.zeros(z.shape, np.int32), "relief_std": sigma},
+            lattice,
+        ),
+        "risk": Bundle(bands, {**lattice, "vehicle": {}}),
         "path": Bundle({"path": path}, path_meta),
         "trajectory": Bundle(
             {

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from rille.stages.calibration import swap_check
 from rille.stages.core.declare import NoParams
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
-from rille.stages.geometry.sides import fits
+from rille.stages.geometry.sides import fits, fits_turned
 from rille.stages.imaging.features import extract
 
 CAMERA = Camera(400.0, 400.0, 319.5, 239.5, 640, 480)
@@ -37,7 +37,7 @@ def test_matches_of_a_camera_that_was_knocked_fit_once_it_is_turned_back_and_tho
         right = CAMERA.project(pose.apply(points)) + rng.normal(0, 0.3, (1000, 2))
         right[::20] = rng.uniform(0, 400, (50, 2))
         assert fits(rig, left, right) < 0.4
-        assert (fits(rig, left, right, turned=True) > share) == (share == 0.9)
+        assert (fits_turned(rig, left, right) > share) == (share == 0.9)
 
 
 def seen(camera, T, texture):

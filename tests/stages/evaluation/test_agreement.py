@@ -52,7 +52,8 @@ def run(
     pieces = [[f for f, p in zip(frames, piece, strict=True) if p == k] for k in range(int(piece.max()) + 1)]
     arrays = {"poses": theirs, "piece": piece.astype(np.int16)}
     arrays["line_distance"] = np.full(len(ours), 0.2) if lines is None else lines
-    trajectory = {"poses": ours} if covariance is None else {"poses": ours, "own_covariance": covariance}
+    own = np.zeros((len(ours), 6, 6)) if covariance is None else covariance
+    trajectory = {"poses": ours, "own_covariance": own, "piece": np.zeros(len(ours), np.int16)}
     given = {"trajectory": Bundle(trajectory, {"frames": frames})}
     out = agreement_stage.run(
         NoParams(), {}, given | {"crosscheck": Bundle(arrays, {"frames": frames, "pieces": pieces})}
@@ -244,7 +245,8 @@ def test_from_one_of_our_pieces_to_the_next_there_is_no_way() -> None:
     ours = true.copy()
     ours[10:] = moved(true[10:], true[10, :, :3].T, -true[10, :, :3].T @ true[10, :, 3])  # begins at its own origin
     frames = list(range(20))
-    given = Bundle({"poses": ours, "piece": np.repeat([0, 1], 10).astype(np.int16)}, {"frames": frames})
+    own = {"piece": np.repeat([0, 1], 10).astype(np.int16), "own_covariance": np.zeros((20, 6, 6))}
+    given = Bundle({"poses": ours} | own, {"frames": frames})
     arrays = {"poses": true, "piece": np.zeros(20, np.int16), "line_distance": np.zeros(20)}
     other = Bundle(arrays, {"frames": frames, "pieces": [frames]})
     metrics = agreement_stage.run(NoParams(), {}, {"trajectory": given, "crosscheck": other}).meta["metrics"]

@@ -75,7 +75,8 @@ def test_figures_without_it_stand_beside_those_as_given() -> None:
     poses = estimated(true, 7)
     frames = list(range(len(true)))
     covariance = np.tile(1e-5 * np.eye(6), (len(true), 1, 1))
-    trajectory = Bundle({"poses": poses, "covariance": covariance}, {"frames": frames})
+    arrays = {"poses": poses, "covariance": covariance, "piece": np.zeros(len(poses), np.int16)}
+    trajectory = Bundle(arrays, {"frames": frames, "main": 0})
     mount = RigidTransform(Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix(), np.array([0.1, 0.0, 0.0]))
     given = rigid.compose(true, rigid.inverse(OFF)).reshape(-1, 12).tolist()
     facts = accuracy_stage(NoParams(), trajectory, frames=frames, truth=given, source=TruthSource(mount)).meta
@@ -93,9 +94,8 @@ def test_figures_without_it_stand_beside_those_as_given() -> None:
 def judged(estimate: Floats, true: Floats, record: Floats, offset: float, apart: float = 0.05) -> list[str]:
     """Warnings on an estimate by poses, and by the positions (n, 3) of their record every 0.05 s, which is late."""
     frames = list(range(len(true)))
-    trajectory = Bundle(
-        {"poses": estimate, "covariance": np.tile(1e-5 * np.eye(6), (len(true), 1, 1))}, {"frames": frames}
-    )
+    covariance, piece = np.tile(1e-5 * np.eye(6), (len(true), 1, 1)), np.zeros(len(true), np.int16)
+    trajectory = Bundle({"poses": estimate, "covariance": covariance, "piece": piece}, {"frames": frames, "main": 0})
     positions = TruePositions(record, apart * np.arange(len(record)) + offset, 0.2 + 1e-9)
     source = TruthSource(record=positions, moments=[0.2 * frame for frame in frames])
     given = {"frames": frames, "truth": true.reshape(-1, 12).tolist(), "source": source}

@@ -155,7 +155,12 @@ def test_stage():
     out = position_accuracy_stage.run(
         NoParams(),
         args,
-        {"trajectory": Bundle({"poses": poses}, {"frames": frames, "verticals": ["attitude"], "main": 0})},
+        {
+            "trajectory": Bundle(
+                {"poses": poses, "piece": np.zeros(len(poses), np.int16)},
+                {"frames": frames, "verticals": ["attitude"], "main": 0},
+            )
+        },
     )
     check_outputs(position_accuracy_stage, out)
     assert np.isnan(out["position_truth"][:, 2]).all()

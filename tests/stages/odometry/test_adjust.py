@@ -202,11 +202,13 @@ def test_a_chain_whose_errors_exceed_its_covariances_takes_them_times_a_factor()
 def test_factors_join_pieces_into_the_frame_of_the_first():
     truth, rng = ring(), np.random.default_rng(6)
     segments, before = run_of(truth, rng, lost={6})
+    assert "broken before frame 6 (dark)" in before.meta["warnings"][0]
+    before.meta["warnings"].append("the ground bends")  # what the trajectory says of something else
     assert before.meta["pieces"] == [list(range(6)), list(range(6, 12))]
     out = adjusted(segments, before, seen(truth, 0, 11, rng), seen(truth, 1, 10, rng))
     assert out.meta["pieces"] == [list(range(12))]
     assert out.meta["verticals"] == ["attitude"]
-    assert not out.meta["warnings"]
+    assert out.meta["warnings"] == ["the ground bends"]
     e = errors(out, truth)[1:]
     assert np.linalg.norm(e[:, :3], axis=1).max() < 0.05
     nees = np.einsum("fi,fij,fj->f", e, np.linalg.inv(out["covariance"][1:]), e) / 6

@@ -304,14 +304,21 @@ def test_strips_of_any_height_give_the_same_bits(monkeypatch: pytest.MonkeyPatch
 
 
 def test_of_a_stored_model_the_tile_alone_is_read() -> None:
+    class Windows:
+        def __init__(self, values: np.ndarray) -> None:
+            self.values = values
+
+        def __getitem__(self, window: tuple[slice, slice]) -> np.ndarray:
+            Watched.cells = max(Watched.cells, self.values[window].size)
+            return self.values[window]
+
     class Watched(dict):
         """Arrays that are read part by part, as those of an artifact."""
 
         cells = 0
 
-        def part(self, name: str, window: tuple[slice, slice]) -> np.ndarray:
-            Watched.cells = max(Watched.cells, self[name][window].size)
-            return self[name][window]
+        def raster(self, name: str) -> Windows:
+            return Windows(self[name])
 
     lattice = Lattice.at(-500, 500, 0.1, 1000, 1000)
     maps = {n: np.full(lattice.shape, 0.5, np.float32) for n in ("elevation", "elevation_std", "residual", "ortho")}

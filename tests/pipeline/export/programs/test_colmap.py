@@ -44,7 +44,7 @@ def parts():
     )
     matches = disparities(pixels[:, 0], RIG.right.project((RIG.T_right_left @ poses[0].inverse()).apply(world)))
     return (
-        Bundle({"poses": given}, {"frames": FRAMES}),
+        Bundle({"poses": given, "piece": np.zeros(3, np.int16)}, {"frames": FRAMES, "main": 0}),
         [MatchedSegment(track, resection, {FRAMES[0]: matches})],
         poses,
         world,
@@ -111,7 +111,7 @@ def driven(folder):
     """The folder and the artifacts of a drive of one leg, which was stopped; lenses were undone."""
     trajectory, segments, _, _ = parts()
     track, resection, matches = segments[0].track, segments[0].resection, segments[0].matches
-    start = Bundle({"poses": trajectory["poses"][:1]}, {"frames": FRAMES[:1]})
+    start = Bundle({n: a[:1] for n, a in trajectory.arrays.items()}, {"frames": FRAMES[:1], "main": 0})
     made = {
         "calibration": Bundle({}, {"rig": RIG.to_dict()}),
         f"hfvm/{FRAMES[0]}": matches[FRAMES[0]],

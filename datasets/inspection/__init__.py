@@ -1,0 +1,1 @@
+"""Inspection of a folder of stereo images: what ``rille init`` finds in it."""
