@@ -277,8 +277,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Parameters
     ----------
     left, right
-        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 0..65535 or floating point 0..255. Pixels that are
-        NaN, or masked by :mod:`numpy.ma`, are not used. Their sizes may differ.
+        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 (0..65535) or floating point (0..255).
+        Pixels that are NaN, or masked by :mod:`numpy.ma`, are not used. Their sizes may differ.
     hfvm
         Parameters of section ``hfvm``, e.g. ``preset="fast"``.
 
