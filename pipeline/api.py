@@ -50,17 +50,22 @@ def reconstruct(
     client
         ``distributed.Client`` of the cluster that computes; None: workers of this machine, one a core.
     frames
-        ``START:STOP[:STEP]``; all by default.
+        ``START:STOP[:STEP]``, numbers from 0, without STOP; all by default.
     runs
         Folder of the results.
     cache
         Folder of the artifacts; ``RILLE_CACHE`` or ``.rille/cache`` by default.
     executor
-        As ``--executor``, where there is no client.
+        ``"dask"``, ``"inline"`` (in this process) or the address of a dask scheduler, where there is no client.
     quiet
         Show no progress; the closing line and what is missing are printed all the same.
     settings
         Parameters by section, e.g. ``locus={"cell_size": 0.002}``.
+
+    Returns
+    -------
+    Run
+        The results. If something could not be delivered, ``run.complete`` is false, and ``run.missing`` says what.
 
     Raises
     ------
@@ -118,6 +123,11 @@ def reconstruct_many(
     same
         What :func:`reconstruct` takes, for all of them.
 
+    Returns
+    -------
+    list
+        Of each sequence, in their order, the :class:`Run`, or the ``RilleError`` that ended it; none is raised.
+
     Examples
     --------
     >>> import rille
@@ -142,6 +152,11 @@ def open_run(path: str | Path, runs: str | Path = "runs") -> Run:
         Its folder, or as a command takes it: ``SEQUENCE`` (the latest of it), ``SEQUENCE/ID``, ``ID``, ``latest``.
     runs
         Folder of all runs.
+
+    Returns
+    -------
+    Run
+        The results; files are read when they are asked for.
 
     Raises
     ------
@@ -209,14 +224,17 @@ class Run:
 
     @property
     def metrics(self) -> Mapping[str, Any]:
-        """Figures by name: each has ``value``, ``unit`` and ``how`` it is found."""
+        """Figures by name: each has ``value``, ``unit``, ``label`` and ``how`` it is found, some the ``truth``, too."""
         return self._fact("metrics", dict)
 
     @property
     def terrain(self) -> xarray.Dataset:
-        """The merged terrain: ``elevation``, its standard deviation and more on (y, x), metres in the world frame.
+        """The merged terrain on (y, x), m in the world frame (x right, y ahead, z up): ``elevation``, NaN unknown, ...
 
-        y falls: ``terrain.sel(y=slice(0.6, 0.4))``. ``terrain.to_netcdf(path)`` and ``terrain.to_zarr(path)`` save it.
+        ``elevation_std`` is its standard deviation, ``relief_std`` that against the ground around, ``spread`` that of
+        the merged models (m); ``slope`` is in degrees, ``ortho`` a grey value 0..255, ``count`` the number of models,
+        ``source`` the pair of the greatest weight. y falls: ``terrain.sel(y=slice(0.6, 0.4))``.
+        ``terrain.to_netcdf(path)`` and ``terrain.to_zarr(path)`` save it.
         An array is read where it is used; ``terrain.chunk()`` makes them dask's, for terrains larger than the memory.
 
         Raises

@@ -65,9 +65,10 @@ ELSEWHERE: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class StereoSequence:
-    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, ``len(sequence)`` how many there are.
+    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, from 0, ``len(sequence)`` how many there are.
 
-    ``sequence[START:STOP]`` and a loop give pairs whose images can be used.
+    ``sequence[START:STOP]`` and a loop give pairs whose images can be used; of any other pair ``sequence[k]`` raises
+    ``InputError`` with the cause.
 
     Attributes
     ----------
@@ -91,7 +92,12 @@ class StereoSequence:
 
     @property
     def rig(self) -> Rig:
-        """The cameras, without lens distortion, and how they stand to each other, as given."""
+        """The cameras, without lens distortion, and how they stand to each other, as given.
+
+        ``rig.left`` and ``rig.right`` have ``fx``, ``fy``, ``cx``, ``cy``, ``width`` and ``height`` (px);
+        ``rig.T_right_left`` maps the left camera's frame to the right one's (x right, y down, z ahead, m), and
+        ``rig.baseline`` is their distance (m).
+        """
         return self.source.rig
 
     def __len__(self) -> int:
@@ -129,7 +135,10 @@ class StereoPair:
 
     @property
     def left(self) -> xarray.DataArray:
-        """Left image (row, col), grey values; its coordinate ``valid`` is not zero where a pixel may be used."""
+        """Left image (row, col), grey values as :func:`match` takes them.
+
+        Where its coordinate ``valid`` (row, col) is 0 a pixel is not used.
+        """
         return self._image("left")
 
     @property
@@ -138,7 +147,13 @@ class StereoPair:
         return self._image("right")
 
     def taken(self, camera: str) -> NDArray[Any]:
-        """Grey values (row, col) of an image as camera ``left`` or ``right`` took it, with its lens distortion."""
+        """Grey values (row, col) of the image of camera ``"left"`` or ``"right"`` as taken, with its lens distortion.
+
+        Raises
+        ------
+        ConfigError
+            There is no such camera.
+        """
         if camera not in CAMERAS:
             raise ConfigError("RIL-748", f"there is no camera {camera!r:.80}", remedy="give 'left' or 'right'")
         image = _computed(_builder(self, self.settings).raw_image(self.frame, camera), {}, self.sequence.drawn)
@@ -146,7 +161,7 @@ class StereoPair:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Parameters that suit the sequence, by section; what is given to a function wins."""
+        """Parameters that suit the sequence, by section; those given to a function come before them."""
         return config.suited(self.sequence.source)
 
     def _bundle(self, camera: str) -> Bundle:
@@ -183,6 +198,11 @@ def open(path: str | Path, **settings: Settings) -> StereoSequence:
         A name from ``rille datasets list``, a folder, or a manifest.
     settings
         Parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
+
+    Returns
+    -------
+    StereoSequence
+        Its pairs; an image is read or rendered when it is asked for.
 
     Raises
     ------
@@ -257,17 +277,18 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     Parameters
     ----------
     left, right
-        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 or floating point 0..255. Pixels that are
-        NaN, or masked by :mod:`numpy.ma`, are not used.
+        Images of a :class:`StereoPair`, or arrays (row, col), uint8, uint16 (0..65535) or floating point (0..255).
+        Pixels that are NaN, or masked by :mod:`numpy.ma`, are not used. Their sizes may differ.
     hfvm
         Parameters of section ``hfvm``, e.g. ``preset="fast"``.
 
     Returns
     -------
     xarray.Dataset
-        ``column_disparity``, ``row_disparity`` (right minus left) and ``disparity_std``, pixels, NaN undefined,
-        ``validity`` (bits) and more, each (row, col) of the left image. Gaps along rows are filled: of ``validity`` the
-        bit 1 is set where a pixel was matched, 2 where it was interpolated.
+        Of each pixel of the left image (row, col): ``column_disparity`` and ``row_disparity``, right minus left,
+        ``disparity_std``, standard deviation along the epipolar line, and ``backmatch_error``, float32 pixels, NaN
+        undefined; ``distance``, float32, least feature distance; ``validity``, uint8. Gaps along rows are filled: of
+        ``validity`` the bit 1 is set where a pixel was matched, 2 where it was interpolated.
 
     Raises
     ------
@@ -354,20 +375,22 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     ----------
     disparity
         Of :func:`match`, of this pair.
+    pair
+        The pair.
     every
-        Each so many-th row and column alone.
+        Take each so many-th row and column alone.
 
     Returns
     -------
     xarray.Dataset
-        ``position`` (point, xyz), ``sigma_along`` and ``sigma_across`` (point), standard deviations along and across
-        the ray, m, without errors of the rig, ``colour`` (point, rgb), 0..255, and ``pixel`` (point, uv), column and
-        row in the left image.
+        ``position`` (point, xyz), m, float64; ``sigma_along`` and ``sigma_across`` (point), standard deviations along
+        and across the ray, m, float32, without errors of the rig; ``colour`` (point, rgb), 0..255, uint8; ``pixel``
+        (point, uv), column and row in the left image, int32.
 
     Raises
     ------
     InputError
-        The disparity is not that of an image of this size.
+        The disparity is not one of :func:`match` for images of this size.
     ConfigError
         ``every`` is no whole number from 1.
 
@@ -437,22 +460,28 @@ def terrain(
     ----------
     disparity
         Of :func:`match`, of this pair.
+    pair
+        The pair.
     reference
-        ``"ground"``, ``"scene"``, or a plane, as parameter ``terrain.reference``.
+        What elevations are measured from: ``"ground"``, ``"scene"``, or a plane ``[nx, ny, nz, x, y, z]``, its normal
+        and a point of it in the left camera's frame (m), as parameter ``terrain.reference``; None: the ground if it
+        is seen, else the scene's plane.
     locus
-        Parameters of section ``locus``, e.g. ``cell_size=0.01``.
+        Parameters of section ``locus``, e.g. ``cell_size=0.01`` (m).
 
     Returns
     -------
     xarray.Dataset
-        ``elevation``, ``elevation_std`` (m), ``ortho`` (grey) and more, each (row, col), with ``x`` and ``y`` (m).
+        Of each cell (row, col), float32, NaN undefined: ``elevation`` and ``elevation_std`` (m), ``ortho``, grey value
+        0..255 of the left image, and ``residual`` (px), mismatch of disparity and calibration. Coordinates ``x`` (col)
+        and ``y`` (row) are those of the cells' centres (m); y falls from row to row.
 
     Raises
     ------
     DegenerateError
-        Nothing is matched, or the pair shows no ground and nothing else is wanted.
+        Nothing is matched, or the pair shows no ground and ``reference`` is ``"ground"``.
     InputError
-        The disparity is not that of an image of this size.
+        The disparity is not one of :func:`match` for images of this size.
     ConfigError
         A parameter is unknown, or not permitted.
 
@@ -495,7 +524,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     Parameters
     ----------
     dem
-        Of :func:`terrain`.
+        Of :func:`terrain`, whole.
     vehicle
         Limits and sizes (metres, degrees), as in section ``vehicle``, or a TOML file of them; None: that of the
         sequence.
@@ -505,8 +534,11 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     Returns
     -------
     xarray.Dataset
-        ``risk`` (0 safe, 1 caution, 2 hazard, 3 unknown), ``p_hazard``, ``reason`` (bits) and the measures, metres and
-        radians, each (row, col).
+        Of each cell (row, col): ``risk``, uint8, 0 safe, 1 caution, 2 hazard, 3 unknown; ``p_hazard`` and ``p_wheel``,
+        probabilities that a measure, or one of a wheel's window, exceeds its limit; ``reason``, uint16, bits of the
+        exceeded limits; ``filled``, uint8, 1 where a small hole was closed, and ``elevation`` (m) so; the measures
+        ``height_range``, ``step``, ``roughness``, ``clearance`` (m), ``inclination``, ``slope`` and ``tilt``
+        (radians). All others are float32. Coordinates are those of ``dem``.
 
     Raises
     ------
@@ -559,16 +591,19 @@ def path(
     Parameters
     ----------
     hazards
-        Of :func:`hazards`.
+        Of :func:`hazards`, whole.
     goal, start
-        X, y, metres, in the frame of the elevation model; None: the last row ahead, the first row.
+        (x, y), metres, in the frame of the elevation model; None: as far ahead as the ground is known and safe, from
+        the rows nearest to the camera.
     path
         Parameters of section ``path``.
 
     Returns
     -------
     xarray.Dataset
-        ``path`` (vertex, xyz), metres, empty where there is none; the attribute ``reason`` says why.
+        ``path`` (vertex, xyz), float64 metres, in the frame of the elevation model: positions of the vehicle's middle
+        from start to goal, z the mean height under a wheel. Where there is none it is empty, and the attribute
+        ``reason`` says why.
 
     Raises
     ------

@@ -14,7 +14,7 @@ class RilleError(Exception):
 
     ``code`` (``RIL-214``) names the message for good, whatever its words become; ``remedy`` says what to change and is
     printed behind the message. Codes: 001-099 command line and configuration, 100-299 input, 300-499 stages,
-    500-599 engine and store, 600-699 outputs.
+    500-599 engine and store, 600-639 outputs, 640-709 findings of ``rille check`` and warnings, 710-998 later ones.
     """
 
     def __init__(self, code: str, message: str, *, remedy: str = "") -> None:
