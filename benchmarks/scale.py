@@ -190,7 +190,7 @@ def image_stage() -> Any:
         return Bundle({"image": np.zeros((4, 4), dtype=np.uint8)}, {"of": f"{args['frame']} {args['camera']}"})
 
     arrays = (Array("image", ("row", "col"), "uint8", "1", "grey value"),)
-    return Stage("image", 1, "nothing", NoParams, (), arrays, run=run)
+    return Stage("image", "nothing", NoParams, (), arrays, run=run)
 
 
 def write_stages(folder: Path) -> None:

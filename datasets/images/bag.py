@@ -150,7 +150,7 @@ def _layout(message: Any, name: str) -> tuple[int, int, int | None]:
     return LAYOUTS[message.encoding]
 
 
-@stage("image", version=2, outputs=files.image_stage.outputs)
+@stage("image", outputs=files.image_stage.outputs)
 def bag_image_stage(
     params: NoParams,
     *,

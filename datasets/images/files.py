@@ -360,7 +360,6 @@ def _unlike(found: Header, wanted: Header, name: str) -> InputError:
 
 @stage(
     "image",
-    version=2,
     outputs=[
         Array("image", ("row", "col"), "uint8", "grey", "image", deep="uint16"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),

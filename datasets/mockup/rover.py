@@ -212,7 +212,6 @@ def true_and_believed(
 
 @stage(
     "mockup.drive",
-    version=3,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "true pose [R | t] of the left camera", frame="bed"),
         Array("vehicle", ("frame", "row", "col"), "float64", "m", "true pose of the vehicle", frame="bed"),

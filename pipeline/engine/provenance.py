@@ -99,9 +99,7 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     found += [f"code: {name.replace('.', '/')}.py {_change(name, old, new)}" for name in _unequal(old, new)]
     old, new = then.get("env", {}), now["env"]
     found += [f"{name} {old.get(name, 'none')} -> {new.get(name, 'none')}" for name in _unequal(old, new)]
-    for what in ("version", "format"):
-        found += _values(what, then.get(what), now[what])
-    return found
+    return found + _values("format", then.get("format"), now["format"])
 
 
 def _values(where: str, old: Any, new: Any) -> list[str]:

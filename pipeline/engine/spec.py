@@ -90,7 +90,7 @@ def _own(spec: Spec, refs: Refs) -> dict[str, Any]:
 def _shared(module: str) -> dict[str, Any]:
     """What all tasks of a stage have in common."""
     stage, code, env = resolve(module), module_digests(module), versions(module)
-    return {"code": code, "env": env, "format": FORMAT, "stage": stage.name, "version": stage.version}
+    return {"code": code, "env": env, "format": FORMAT, "stage": stage.name}
 
 
 @cache

@@ -73,7 +73,7 @@ def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:
             writers[args["file"]](Path(folder) / args["file"], _restored(args["run"], bundles))
             return pack(Path(folder))
 
-    return Stage(name, 1, summary, NoParams, ("read*",), (CONTENT,), run, Memory(fixed=300e6, factor=1.0, result=0.1))
+    return Stage(name, summary, NoParams, ("read*",), (CONTENT,), run, Memory(fixed=300e6, factor=1.0, result=0.1))
 
 
 class _Unkept(Mapping[str, AnyArray]):

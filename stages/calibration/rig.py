@@ -362,7 +362,7 @@ def _row_shifts(start: Sequence[Linear], columns: list[int], usual: Floats, depa
     return moved
 
 
-@stage("rig", version=3)
+@stage("rig")
 def rig_stage(
     params: RigParams,
     orientations: Sequence[Bundle[OrientationFacts]] = (),

@@ -165,7 +165,6 @@ class Stage(Generic[M, F]):
     """
 
     name: str
-    version: int
     summary: str
     params: type[M]
     inputs: tuple[str, ...]
@@ -190,7 +189,7 @@ class Stage(Generic[M, F]):
 
 
 def stage(
-    name: str, *, version: int = 1, outputs: Sequence[Array] = (), memory: Memory = Memory()
+    name: str, *, outputs: Sequence[Array] = (), memory: Memory = Memory()
 ) -> Callable[[Callable[Concatenate[M, P], Bundle[F]]], Stage[M, F]]:
     """Declare a function as a stage: its signature says the parameters, the ports, the arguments and the facts.
 
@@ -208,7 +207,6 @@ def stage(
     keyword the arguments that identify a task, which travel as JSON: one that is annotated with a class that has
     ``from_dict`` or ``from_matrix``, with a ``NamedTuple`` or a model of pydantic arrives as such an object. The
     docstring's first line is the summary.
-    ``version`` is raised when results change although the code of the module does not.
     """
 
     def declare(function: Callable[Concatenate[M, P], Bundle[F]]) -> Stage[M, F]:
@@ -235,7 +233,6 @@ def stage(
         summary = line[:1].lower() + line[1:] if line[1:2].islower() or line[1:2] == " " else line
         return Stage(
             name,
-            version,
             summary,
             types[first.name],
             inputs,

@@ -191,7 +191,6 @@ class MonitorInputs(NamedTuple):
 
 @stage(
     "obstacle_monitor",
-    version=2,
     outputs=[
         Array("raised", ("frame",), "int32", "1", "points of the largest raised group"),
         Array("where", ("frame", "xy"), "float64", "m", "its place, right and ahead of the vehicle's centre", "nan"),

@@ -163,7 +163,6 @@ def pose_rows(poses: Sequence[Sequence[float] | None]) -> Floats:
 
 @stage(
     "accuracy",
-    version=8,
     outputs=[
         Array("position", ("frame", "xyz"), "float64", "m", "estimated position", "nan", "world"),
         Array("position_truth", ("frame", "xyz"), "float64", "m", "true position, laid on it", "nan", "world"),

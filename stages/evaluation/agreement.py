@@ -171,7 +171,6 @@ def unbroken(theirs: NDArray[np.int64], ours: NDArray[np.int64]) -> NDArray[np.i
 
 @stage(
     "agreement",
-    version=5,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "crosscheck's poses in the world", "nan", "world"),
         Array("distance", ("frame",), "float64", "m", "disagreement in position", "nan"),

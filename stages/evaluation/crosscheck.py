@@ -244,7 +244,6 @@ def _read(model: Any, frames: int) -> Floats:
 
 @stage(
     "crosscheck",
-    version=3,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "window"),
         Array("line_distance", ("frame",), "float64", "px", "median of the matches from their epipolar lines", "nan"),

@@ -65,7 +65,6 @@ def _fade(earlier: Floats, later: Floats) -> Floats:
 
 @stage(
     "crosscheck_join",
-    version=3,
     outputs=[
         Array("poses", ("frame", "row", "col"), "float64", "m", "pose [R | t] of the left camera", "nan", "piece"),
         Array("piece", ("frame",), "int16", "1", "unbroken piece that the frame belongs to", "-1"),

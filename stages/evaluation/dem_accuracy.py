@@ -58,7 +58,7 @@ def in_window(lattice: Lattice, window: Sequence[float] | None) -> Bools:
     return (x >= x_min - slack) & (x <= x_max + slack) & (y >= y_min - slack) & (y <= y_max + slack)
 
 
-@stage("dem_accuracy", version=3, outputs=[raster("error", "m", "elevation minus truth")])
+@stage("dem_accuracy", outputs=[raster("error", "m", "elevation minus truth")])
 def dem_accuracy_stage(
     params: NoParams, dem: Sequence[Bundle], truth: Bundle, *, window: list[float] | None = None
 ) -> Bundle[DemAccuracyFacts]:

@@ -66,7 +66,6 @@ def localisation(estimate: Floats, truth: Floats, length: float) -> tuple[Floats
 
 @stage(
     "drive_check",
-    version=4,
     outputs=[
         Array("error", ("frame",), "float64", "m", "distance of the estimated from the true position", "nan"),
         Array("way", ("position", "xyz"), "float64", "m", "true position of the vehicle on the ground", frame="truth"),

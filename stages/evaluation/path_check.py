@@ -94,7 +94,7 @@ def _shortest(path: Floats, maps: Maps, lattice: Lattice, vehicle: Vehicle) -> f
     return float(cost[last]) * COST_UNIT_M if cost[last] < UNREACHED else None
 
 
-@stage("path_check", version=2)
+@stage("path_check")
 def path_check_stage(params: NoParams, path: Bundle, risk: Bundle) -> Bundle[MetricsFacts]:
     """Planned path against the risk map of the exact elevations."""
     lattice = Lattice.from_dict(risk.meta["lattice"])

@@ -180,7 +180,7 @@ def _clock(offset: Offset) -> dict[str, Metric]:
     }
 
 
-@stage("position_accuracy", version=2, outputs=accuracy_stage.outputs)
+@stage("position_accuracy", outputs=accuracy_stage.outputs)
 def position_accuracy_stage(
     params: NoParams,
     trajectory: Bundle[TrajectoryFacts],

@@ -124,7 +124,6 @@ def window_cells(side: float, cell: float) -> int:
 
 @stage(
     "risk",
-    version=6,
     outputs=[
         raster("risk", "1", "class: 0 safe, 1 caution, 2 hazard, 3 unknown", "uint8", ""),
         raster("reason", "1", "bits: " + ", ".join(f"{bit} {name}" for name, bit in REASONS.items()), "uint16", ""),

@@ -136,7 +136,6 @@ OUTPUTS = (
 
 @stage(
     "hfvm",
-    version=3,
     outputs=OUTPUTS,
     memory=Memory(fixed=30e6, factor=10.0, result=1.6, lower=("hfvm.preset",)),
 )

@@ -234,7 +234,6 @@ def filled_from(above: Floats32, image: Floats32, mask: Bools, y: int = 0, x: in
 
 @stage(
     "pyramid",
-    version=2,
     outputs=[
         Array("level_*", ("row", "col"), "float32", "1", "grey value 0..255, 0 where masked"),
         Array("valid_*", ("row", "col"), "uint8", "1", "1 = usable"),

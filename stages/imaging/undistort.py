@@ -80,7 +80,6 @@ def _resample(spline, usable, maps, out, out_valid):  # type: ignore[no-untyped-
 
 @stage(
     "undistort",
-    version=2,
     outputs=[
         Array("image", ("row", "col"), "float32", "grey", "image of an ideal camera, 0..255, 0 where masked"),
         Array("valid", ("row", "col"), "uint8", "1", "1 = usable"),

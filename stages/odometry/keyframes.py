@@ -138,7 +138,7 @@ def _warnings(overlap: Sequence[float | None], params: KeyframesParams) -> list[
     ]
 
 
-@stage("keyframes", version=3)
+@stage("keyframes")
 def keyframes_stage(
     params: KeyframesParams,
     steps: Sequence[Bundle[StepTableFacts]],

@@ -34,7 +34,6 @@ def greatest_move(before: RigidTransform, after: RigidTransform, local: DemFacts
 
 @stage(
     "pose",
-    version=3,
     outputs=[
         replace(POSES, frame="world", nodata=""),
         replace(COVARIANCE, frame="world", nodata=""),

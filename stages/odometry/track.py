@@ -155,7 +155,6 @@ def _there_and_back(a: Floats32, b: Floats32, valid: Mask, templates: Templates,
 
 @stage(
     "track",
-    version=3,
     outputs=[Array("points", ("point", "frame", "uv"), "float32", "px", "column and row of the point", nodata="nan")],
 )
 def track_stage(

@@ -357,7 +357,6 @@ def nearest_middle(cells: Bools, row: int) -> Cell:
 
 @stage(
     "path",
-    version=4,
     outputs=[Array("path", ("vertex", "xyz"), "float64", "m", "vertices from start to target; z = mean under a wheel")],
     memory=Memory(factor=6.0, lower=("locus.cell_size",)),
 )

@@ -366,7 +366,7 @@ def independent_cells(field: Floats) -> float:
     return float(np.isfinite(field).sum()) * ((1.0 - alike) / (1.0 + alike)) ** 2
 
 
-@stage("map_localization", version=3)
+@stage("map_localization")
 def map_localization_stage(
     params: MapLocalizationParams,
     dem: Bundle[DemFacts] | None = None,

@@ -306,7 +306,6 @@ def _fine(dem: Bundle, lattice: Lattice, most: float | None) -> Callable[[str, W
 
 @stage(
     "merge",
-    version=4,
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", "float32", "nan", "world"),
         raster("elevation_std", "m", "standard deviation of the elevation, all included", "float32", "nan", "world"),

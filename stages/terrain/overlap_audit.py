@@ -79,7 +79,7 @@ def describe(model: Facts) -> str:
     return words + (", either may be wrong" if model["either"] else "")
 
 
-@stage("overlap_audit", version=3)
+@stage("overlap_audit")
 def overlap_audit_stage(params: NoParams, seams: Sequence[Bundle[OverlapFacts]]) -> Bundle[AuditFacts]:
     """Which elevation models contradict their neighbours, in bias and tilt, the worst first."""
     every = [s for bundle in seams for s in bundle.meta["seams"]]

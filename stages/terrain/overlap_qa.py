@@ -98,7 +98,7 @@ def _log_ratio(grey: Floats, other: Floats) -> float | None:
     return float(np.median(np.log(grey[good] / other[good])))
 
 
-@stage("overlap_qa", version=4)
+@stage("overlap_qa")
 def overlap_qa_stage(
     params: NoParams, dem: Bundle[DemFacts], others: Sequence[Bundle[DemFacts]]
 ) -> Bundle[OverlapFacts]:

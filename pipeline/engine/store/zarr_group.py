@@ -32,7 +32,7 @@ def encode(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, An
     }
     variables |= cf_coordinates.located(variables, bundle.meta)
     nodes = {name: _node(*variable) for name, variable in variables.items()}
-    source = f"Rille, stage {stage.name}, version {stage.version}: {stage.summary}"
+    source = f"Rille, stage {stage.name}: {stage.summary}"
     group = {
         "attributes": {"stage": stage.name, "source": source, "meta": dict(bundle.meta)},
         "zarr_format": 3,

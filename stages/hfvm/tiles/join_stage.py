@@ -39,7 +39,7 @@ class Joined(Mapping[str, AnyArray]):
         return len(OUTPUTS)
 
 
-@stage("hfvm_join", version=2, outputs=OUTPUTS)
+@stage("hfvm_join", outputs=OUTPUTS)
 def hfvm_join_stage(
     params: HfvmParams, left: Bundle, right: Bundle, coarse: Bundle[TileFacts], tiles: Sequence[Bundle], *, side: int
 ) -> Bundle[DisparityFacts]:

@@ -200,7 +200,7 @@ _PARTS = (
 _RESULTS = tuple(replace(a, optional=True) for a in OUTPUTS if a.name not in ("distance", "validity"))
 
 
-@stage("hfvm_tile", version=2, outputs=(*_PARTS, *_RESULTS))
+@stage("hfvm_tile", outputs=(*_PARTS, *_RESULTS))
 def hfvm_tile_stage(params: HfvmParams, given: TileInputs, *, step: str, side: int, tile: int = 0) -> Bundle[TileFacts]:
     """One step of matching a large stereo pair, for one tile."""
     return STEPS[step](Task(params, given, side, tile))

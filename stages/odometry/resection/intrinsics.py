@@ -275,7 +275,7 @@ def inverse_depth_std(yaw: Sequence[float], baseline: float) -> float:
     return float(2.0 ** (round(2.0 * math.log2(math.hypot(*yaw) / baseline)) / 2.0))
 
 
-@stage("intrinsics", version=6)
+@stage("intrinsics")
 def intrinsics_stage(
     params: IntrinsicsParams,
     segments: Sequence[Bundle[ResectFacts]],

@@ -275,7 +275,6 @@ def of_pair_behind(tracks: Floats32, segment: SegmentPoses, inputs: ResectInputs
 
 @stage(
     "resect",
-    version=6,
     outputs=[
         replace(POSES, frame="local"),
         replace(COVARIANCE, frame="local"),

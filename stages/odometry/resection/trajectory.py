@@ -298,7 +298,6 @@ class TrajectoryInputs(NamedTuple):
 
 @stage(
     "trajectory",
-    version=5,
     outputs=[
         replace(POSES, frame="world"),
         replace(COVARIANCE, frame="world"),

@@ -133,7 +133,6 @@ class LegInputs(NamedTuple):
 
 @stage(
     "local_planner",
-    version=13,
     outputs=[
         Array(
             "path",

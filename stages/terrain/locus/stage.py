@@ -247,7 +247,6 @@ class LocusInputs(NamedTuple):
 
 @stage(
     "locus",
-    version=7,
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),

@@ -33,7 +33,6 @@ from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(
     name="toy",
-    version=1,
     summary="",
     params=NoParams,
     inputs=(),

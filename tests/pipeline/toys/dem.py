@@ -23,7 +23,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="toy_dem",
-    version=1,
     summary="disk",
     params=NoParams,
     inputs=(),

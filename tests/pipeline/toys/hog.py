@@ -15,7 +15,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="hog",
-    version=1,
     summary="takes memory",
     params=NoParams,
     inputs=("after?",),

@@ -45,7 +45,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="mischief",
-    version=1,
     summary="misbehaves",
     params=NoParams,
     inputs=("after?",),

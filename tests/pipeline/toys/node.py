@@ -14,7 +14,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="node",
-    version=1,
     summary="sums",
     params=NoParams,
     inputs=("read*",),

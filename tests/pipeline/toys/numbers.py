@@ -22,7 +22,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="numbers",
-    version=1,
     summary="random numbers",
     params=NumbersParams,
     inputs=(),

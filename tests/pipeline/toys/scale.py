@@ -19,7 +19,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="scale",
-    version=1,
     summary="twice as much",
     params=ScaleParams,
     inputs=("values",),

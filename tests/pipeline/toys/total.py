@@ -12,7 +12,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="total",
-    version=1,
     summary="sums",
     params=NoParams,
     inputs=("parts*", "extra?"),

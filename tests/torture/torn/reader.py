@@ -12,7 +12,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="reader",
-    version=1,
     summary="reads",
     params=NoParams,
     inputs=("values",),

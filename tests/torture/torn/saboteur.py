@@ -59,7 +59,6 @@ def _run(params, args, inputs):
 
 STAGE = Stage(
     name="saboteur",
-    version=1,
     summary="kills its process",
     params=NoParams,
     inputs=("after?",),
