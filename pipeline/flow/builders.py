@@ -135,11 +135,10 @@ class Builder:
         # A section is named as its stage; a stage without parameters has none.
         return self.graph.call(stage, label, params or getattr(self.config, stage.name, NO_PARAMS), **given)
 
-    def recalibrate(self, correction: list[float], since: int) -> None:
+    def recalibrate(self, correction: list[float]) -> None:
         """Correct the calibration; tasks that do not depend on it are laid out as before."""
         self._take(recalibrated(self.uncorrected, correction))
         self.correction = correction
-        self.discard(since)
 
     def discard(self, since: int) -> None:
         """Mark the tasks from number ``since`` on as outdated, unless they are laid out again."""

@@ -50,7 +50,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Generator, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -167,60 +167,76 @@ class Tracked:
     moved: Collection[int]
 
 
+@dataclass(frozen=True)
+class Learnt:
+    """What attempts have shown: frames that are ``refused`` or ``torn`` (None: not looked for yet), with the cause;
+    ``knocks`` of the rig, by pair; ``corrections`` of the calibration, of which the last one counts."""
+
+    refused: Mapping[int, str] = field(default_factory=dict)
+    torn: dict[int, str] | None = None
+    knocks: Mapping[int, ResectFacts] = field(default_factory=dict)
+    corrections: tuple[list[float], ...] = ()
+
+
 def tracked(
     make: Builder, frames: Series[int], whole: list[int], screening: Ref[ScreeningFacts]
 ) -> Generator[Wait, Any, Tracked | None]:
-    """Match the basic pairs and track between them; None where nothing can be measured.
-
-    Repeat without the images, or with corrected cameras, that the tracks contradict; from a knock of the rig on with
-    the rig that it left.
-    """
-    p, attempt, since = make.products, 0, len(make.graph.nodes)
-    refused, torn, knocks = dict[int, str](), None, dict[int, ResectFacts]()
+    """Match the basic pairs and track between them, again as long as that shows what to do otherwise; None where
+    nothing can be measured."""
+    learnt, since = Learnt(), len(make.graph.nodes)
     while True:
-        if attempt and p.crosscheck is not None:
-            p.crosscheck = crosscheck_tasks(make, whole)
-        choice = yield from simultaneous(make, frames, whole, screening, refused | (torn or {}))
-        if choice is None:
-            return None
-        yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
-        matched = yield from matched_pairs(make, after_knocks(make, choice.rigs, knocks))
-        # Of most pairs a wrong rig is the cause, of few their images.
-        impossible = [k for k, level in p.ground.items() if level.error is not None]
-        if 0 < 2 * len(impossible) < len(matched):
-            refused |= dict.fromkeys(impossible, MISFIT)
-            make.discard(since)
-            continue
+        found = yield from attempted(make, frames, whole, screening, learnt)
+        if not isinstance(found, Learnt):
+            return found
+        if found.corrections != learnt.corrections:
+            make.recalibrate(found.corrections[-1])
+        make.discard(since)
+        learnt = found
 
-        # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
-        runs = [[choice.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
-        segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
-        moved = yield from behind_knocks(make, matched, segments)
-        # A knock leaves another rig than the one given.
-        sound = [s for s in segments if s.frames[0] not in moved]
-        wanted = suspects(sound, choice.chain) if torn is None else confirmed(sound, choice.chain, torn)
-        if wanted != (torn or {}):
-            torn = wanted
-            make.discard(since)
-            continue
-        key = matched[choice.basic[0]]
-        judged = sound and make.config.resect.joint
-        correction = (yield from corrected_calibration(make, key, [s.resection for s in sound])) if judged else None
-        # Behind more than four knocks no frame has a pose.
-        first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(knocks) < 4
-        if correction is None and followed and first is not None and first not in knocks:
-            knocks[first] = moved[first]
-            make.discard(since)
-            continue
-        if correction is None or attempt == MAX_CALIBRATIONS:
-            if p.intrinsics is not None:
-                p.contradictions.append(p.intrinsics)
-            segments = refused_behind(make, matched, segments, moved)
-            p.resections = [s.resection for s in segments]
-            return Tracked(choice, matched, segments, moved.keys())
-        make.recalibrate(correction["corrected"], since)
-        knocks.clear()  # a wrong rig may look as if it was knocked
-        attempt += 1
+
+def attempted(
+    make: Builder, frames: Series[int], whole: list[int], screening: Ref[ScreeningFacts], learnt: Learnt
+) -> Generator[Wait, Any, Tracked | Learnt | None]:
+    """One attempt at :func:`tracked` by what is ``learnt``. What shows a further image that the tracks contradict, a
+    knock of the rig, or a wrong calibration, ends it: then it returns what is learnt by that."""
+    p = make.products
+    if learnt.corrections and p.crosscheck is not None:
+        p.crosscheck = crosscheck_tasks(make, whole)
+    choice = yield from simultaneous(make, frames, whole, screening, {**learnt.refused, **(learnt.torn or {})})
+    if choice is None:
+        return None
+    yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
+    matched = yield from matched_pairs(make, after_knocks(make, choice.rigs, learnt.knocks))
+    # Of most pairs a wrong rig is the cause, of few their images.
+    impossible = [k for k, level in p.ground.items() if level.error is not None]
+    if 0 < 2 * len(impossible) < len(matched):
+        return replace(learnt, refused={**learnt.refused, **dict.fromkeys(impossible, MISFIT)})
+
+    # From each basic pair to the next: tracks, and poses in its frame. ``segments`` holds places in the chain.
+    runs = [[choice.chain[i] for i in part] for part in choice.keyframes.meta["segments"]]
+    segments = [make.segment(run, matched[run[0]], after=matched.get(run[-1])) for run in runs]
+    moved = yield from behind_knocks(make, matched, segments)
+    # A knock leaves another rig than the one given.
+    sound = [s for s in segments if s.frames[0] not in moved]
+    torn = suspects(sound, choice.chain) if learnt.torn is None else confirmed(sound, choice.chain, learnt.torn)
+    if torn != (learnt.torn or {}):
+        return replace(learnt, torn=torn)
+
+    key = matched[choice.basic[0]]
+    judged = sound and make.config.resect.joint
+    correction = (yield from corrected_calibration(make, key, [s.resection for s in sound])) if judged else None
+    if correction is not None and len(learnt.corrections) < MAX_CALIBRATIONS:
+        # A wrong rig may look as if it was knocked.
+        return replace(learnt, knocks={}, corrections=(*learnt.corrections, correction["corrected"]))
+    # Behind more than four knocks no frame has a pose.
+    first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(learnt.knocks) < 4
+    if correction is None and followed and first is not None and first not in learnt.knocks:
+        return replace(learnt, knocks={**learnt.knocks, first: moved[first]})
+    if p.intrinsics is not None:
+        p.contradictions.append(p.intrinsics)
+    segments = refused_behind(make, matched, segments, moved)
+    p.resections = [s.resection for s in segments]
+    return Tracked(choice, matched, segments, moved.keys())
 
 
 def matched_pairs(
