@@ -57,6 +57,9 @@ WITHIN = 1e-6
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
+HEADING = re.compile(r"(?<![a-z])(head(ing)?|hdg|course|cog|bearing|azimuth|orientation|direction|angle|psi)(?![a-z])")
+"""Part of names of columns that may be a yaw, of which they do not tell the sense and the beginning."""
+
 DOWNWARDS = re.compile(r"(.*[./])?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
@@ -290,6 +293,9 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
+            if headings := [name for name in table.header if HEADING.search(name)]:
+                remedy = f"write a column yaw_deg: 90 less {headings[0]} if that is degrees clockwise from y (north), or "
+                remedy += "its values if they are degrees counter-clockwise from x"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     frames = by_name.untimed(table)
