@@ -162,6 +162,9 @@ def writable(name: str) -> None:
         raise InputError("RIL-185", text, remedy="rename it")
 
 
+CAMERA_NUMBER = re.compile(r"(?<![a-z])cam(era)?[_-]?\d+$", re.I)
+"""End of a name that numbers a camera, any two numbers of which are two cameras."""
+
 COUNTER = re.compile(r"(\d{3,})\D*$")
 """The last number of a name, of three digits or more."""
 
@@ -246,7 +249,8 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
     """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/X_07 and B/Y_07.
 
     In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside. Of
-    several one whose words differ by more than a number is taken: A/0, A/1, B/0 and B/1 are two frames of A and of B.
+    several one that numbers cameras is taken, or one whose words differ by more than a number: A/0, A/1, B/0 and B/1
+    are two frames of A and of B.
     ``timed``: time stamps in the names aside, which may differ between the cameras.
     """
     found = []
@@ -261,10 +265,11 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
         kinds = sorted({split[k] for split in words}, key=natural)
         parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
         rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
-        if rest[0] == rest[1] and (len(rest[0]) > 1 or (timed and min(map(len, parts.values())) > 1)):
-            found.append(parts)
-    named = [parts for parts in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
-    found = named if found[1:] else found
+        cameras = all(CAMERA_NUMBER.search("".join(split[: k + 1])) for split in words)
+        if rest[0] == rest[1] and (len(rest[0]) > 1 or cameras or (timed and min(map(len, parts.values())) > 1)):
+            found.append((parts, cameras))
+    named = [parts for parts, _ in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
+    found = ([parts for parts, cameras in found if cameras] or named) if found[1:] else [parts for parts, _ in found]
     return found[0] if len(found) == 1 else {}
 
 
