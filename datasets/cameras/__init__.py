@@ -56,7 +56,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
-    (lambda f: any(isinstance(f.values[key], dict) for key in f.values if slam.CAMERA.fullmatch(key)), slam.kalibr),
+    (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),
     (lambda f: "cam0_calib" in f, slam.vins),

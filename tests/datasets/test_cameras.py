@@ -397,9 +397,9 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     a, between = RigidTransform(ROTATION, [0.1, 0.2, 0.3]), RigidTransform(np.eye(3), SHIFT)
     b = between @ a
 
-    def rig(*poses):
+    def rig(*poses, name="cam"):
         text = "".join(
-            f"cam{n}: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512], {key}: "
+            f"{name}{n}: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512], {key}: "
             f"{np.vstack([T.matrix34, [0, 0, 0, 1]]).tolist()}}}\n"
             for n, (key, T) in enumerate(poses)
         )
@@ -413,6 +413,10 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     np.testing.assert_allclose(rig(*mixed), between.matrix34, atol=1e-12)
     expected = (b @ (b.inverse() @ a).inverse()).matrix34
     np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
+    for key in ("T_BS", "T_SC"):
+        np.testing.assert_allclose(rig((key, a.inverse()), (key, b.inverse()), name="camera_"), between.matrix34)
+    with raises("RIL-766", "camera_0.T_b"):
+        rig(("T_b", a.inverse()), ("T_b", b.inverse()), name="camera_")
 
 
 def test_kalibr_of_one_camera(tmp_path):
