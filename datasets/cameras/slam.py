@@ -54,7 +54,8 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
         T, before = (None if whole else _of_body(part)), poses[-1]
         # Each pose is relative to the camera before, so that poses multiply along the chain.
         poses.append(part.pose("T_cn_cnm1") @ before if T is None and before and "T_cn_cnm1" in part else T)
-        if poses[-1] is None:
+    for part, T in zip(parts, poses, strict=True):
+        if T is None:
             part.check_turn()
     return [
         CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)

@@ -414,7 +414,8 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     expected = (b @ (b.inverse() @ a).inverse()).matrix34
     np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
     for key in ("T_BS", "T_SC"):
-        np.testing.assert_allclose(rig((key, a.inverse()), (key, b.inverse()), name="camera_"), between.matrix34, atol=1e-12)
+        found = rig((key, a.inverse()), (key, b.inverse()), name="camera_")
+        np.testing.assert_allclose(found, between.matrix34, atol=1e-12)
     with raises("RIL-766", "camera_0.T_b"):
         rig(("T_b", a.inverse()), ("T_b", b.inverse()), name="camera_")
 
