@@ -292,10 +292,11 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
-            remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
-            if headings := [name for name in table.header if HEADING.search(name)]:
-                remedy = f"write a column yaw_deg: 90 less {headings[0]} if that is degrees clockwise from y (north); "
-                remedy += "its values if they are degrees counter-clockwise from x"
+            heading = next((name for name in table.header if HEADING.search(name)), "")
+            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading} if "
+            hint = f"{hint}it is degrees counter-clockwise from x; or " if heading else ""
+            remedy = f"{hint}add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or "
+            remedy += "[truth]"
             raise InputError("RIL-801", text, remedy=remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     frames = by_name.untimed(table)
