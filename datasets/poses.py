@@ -293,11 +293,10 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
             heading = next((name for name in table.header if HEADING.search(name)), "")
-            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading} if "
-            hint = f"{hint}it is degrees counter-clockwise from x; or " if heading else ""
-            remedy = f"{hint}add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or "
-            remedy += "[truth]"
-            raise InputError("RIL-801", text, remedy=remedy)
+            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), or {heading}"
+            hint = f"{hint} if it is degrees counter-clockwise from x; else " if heading else ""
+            remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
+            raise InputError("RIL-801", text, remedy=hint + remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     frames = by_name.untimed(table)
     bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])
