@@ -293,8 +293,8 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
             heading = next((name for name in table.header if HEADING.search(name)), "")
-            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), or {heading}"
-            hint = f"{hint} if it is degrees counter-clockwise from x; else " if heading else ""
+            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading}"
+            hint = f"{hint} if it is counter-clockwise from x; else " if heading else ""
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
             raise InputError("RIL-801", text, remedy=hint + remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
