@@ -203,7 +203,7 @@ class TimedPositions:
 
 
 def positions_of(
-    table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None
+    table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None, *, held: bool = False
 ) -> TimedPositions | None:
     """Positions of a table without rotations; None if the file holds poses.
 
@@ -213,6 +213,7 @@ def positions_of(
     columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, unless the table's names are clear; with any of
         them the table is one of positions.
     unit : as for :func:`poses_of`.
+    held : rows that repeat the last measurement are left out, where a log is faster than its sensor.
 
     Raises
     ------
@@ -244,7 +245,8 @@ def positions_of(
     timed = [meant["time"]] if "time" in meant else []
     named, warnings = not timed and bool(np.isinf(table.values([0])).all()), tuple[str, ...]()
     if timed or named:  # else rows are pairs
-        table, left_out = table.measured([*timed, *placed], _without_fix(table, *placed[:2]))
+        lost = _without_fix(table, *placed[:2])
+        table, left_out = table.measured([*timed, *placed], lost | _held(table.values(placed)) if held else lost)
         warnings += left_out
     rows = _lengths(table, placed, unit)
     warnings += _rounded(rows, table.name)
@@ -273,6 +275,13 @@ def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
     none = ((quality == 0) & (quality > 0).any(axis=0)).any(axis=1)
     # 1000 m: no vehicle jumps so far.
     return np.asarray(none | ((away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)))
+
+
+def _held(values: Floats) -> Bools:
+    """Rows (n,) of values (n, k) that are those of the row before; none unless most values stand in several rows."""
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    lengths = np.diff(np.flatnonzero(np.append(~same, True)))
+    return np.asarray(same & (len(lengths) > 2 and np.median(lengths) >= 2))
 
 
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:

@@ -373,7 +373,7 @@ class MotionReader:
             pairs.
         """
         table = self.table(section.file)
-        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit)
+        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit, held=True)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")

@@ -935,13 +935,15 @@ E = "431000,5411000,100"
         ("time,x,y,z", ["0,0,0,0", "0.5,1,0,0", "1,2,0,0"], (0, 0.5, 1)),  # where the drive begins
         ("time,x,y,z,quality", [f"0,{E},0", f"0.5,{E},4", f"1,{E},5"], (0.5, 1)),
         ("time,x,y,z,q", [f"0,{E},0", f"0.5,{E},0", f"1,{E},0"], (0, 0.5, 1)),  # says nothing
+        ("time,x,y,z", [f"{k / 4},{k // 2},0,0" for k in range(6)], (0, 0.5, 1)),  # held until the next one
+        ("time,x,y,z", [f"{k / 4},{max(k, 2)},0,0" for k in range(6)], (0, 0.25, 0.5, 0.75, 1, 1.25)),  # stood
     ],
 )
 def test_positions_without_a_fix_are_left_out_and_counted(tmp_path, names, rows, left):
     write_lines(tmp_path / "gnss.csv", [names, *rows])
     s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n'))
     assert tuple(s.priors["positions"]["times"]) == left
-    assert sum("RIL-706" in line for line in s.warnings) == (len(left) < 3)
+    assert sum("RIL-706" in line for line in s.warnings) == (len(left) < len(rows))
 
 
 @pytest.mark.parametrize("place", ["", "origin = [1e3, 2e3, 0]\nazimuth_deg = 0\n"])
