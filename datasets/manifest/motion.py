@@ -312,8 +312,12 @@ class MotionReader:
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: model.PoseFile | model.Attitude, times: Sequence[float], table: str) -> None:
-        """Refuse rows that mostly are more than ``max_gap``, s, apart, so that nothing can be interpolated."""
-        spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        """Refuse rows that mostly are more than ``max_gap``, s, apart about the pairs, so that nothing can be
+        interpolated."""
+        rows = np.array(times)
+        after = np.searchsorted(rows, self.sequence.times or ())
+        after = after[(after > 0) & (after < len(rows))]
+        spacing = float(np.median(rows[after] - rows[after - 1])) if len(after) else 0.0
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"

@@ -807,9 +807,10 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     assert len(warnings) <= 2
 
 
-def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path):
+@pytest.mark.parametrize("rows", [(-0.5, 0.55, 1.6), (-0.501, -0.5, 0.55, 0.551, 1.601, 1.602)])
+def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path, rows):
     path = write_sequence(tmp_path, '[times]\nrate_hz = 10.0\n[truth]\nfile = "p.tum"\n', frames=9)
-    write_lines(tmp_path / "p.tum", [tum(t, t) for t in (-0.5, 0.55, 1.6)])
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in rows])
     with raises("RIL-804", "1.05 s apart, more than 0.5 s"):
         opened(path)
     # At the times of the images nothing has to be.
