@@ -47,7 +47,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
     (states(r"'lensmodel'"), slam.mrcal),
-    (lambda text: 'Intrinsic of "Infrared 1"' in text, makers.realsense),
+    (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
     (lambda text: bool(makers.numbers_of_matrix(text)), makers.matrix),
 )

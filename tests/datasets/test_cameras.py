@@ -766,24 +766,30 @@ def test_a_rotation_that_is_not_read_is_refused(tmp_path, turned):
         read_cameras(written(tmp_path, json.dumps(FIGURES | {"rotation": [0, 0.1, 0], "translation": [-0.12, 0, 0]})))
 
 
-def test_a_realsense(tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "model", "k1", "lens"),
+    [("Infrared", "Brown Conrady", 0, False), ("Fisheye", "Kannala Brandt4", -0.005, "fisheye")],
+)
+def test_a_realsense(tmp_path, kind, model, k1, lens):
     def camera(number, width, height):
         figures = f"PPX: \t{width / 2}\n  PPY: \t{height / 2}\n  Fx: \t{width / 2}\n  Fy: \t{width / 2}"
-        lens = "Distortion: \tBrown Conrady\n  Coeffs: \t0  \t0  \t0  \t0  \t0  \n  FOV (deg): \t89.9 x 58.9"
-        head = f'Intrinsic of "Infrared {number}" / {width}x{height} / {{Y8}}'
+        lens = f"Distortion: \t{model}\n  Coeffs: \t{k1}  \t0  \t0  \t0  \t0  \n  FOV (deg): \t89.9 x 58.9"
+        head = f'Intrinsic of "{kind} {number}" / {width}x{height} / {{Y8}}'
         return f" {head}\n  Width: \t{width}\n  Height: \t{height}\n  {figures}\n  {lens}\n\n"
 
     text = "Device info:\n    Name : \tIntel RealSense D435I\n\nIntrinsic Parameters:\n\n"
     text += "".join(camera(n, *size) for n in (1, 2) for size in ((848, 480), (640, 480), (640, 480)))
-    for name, first in (("Depth", -0.015), ("Infrared 2", -0.0499)):
-        text += f'Extrinsic from "Infrared 1"\t  To\t  "{name}" :\n Rotation Matrix:\n'
+    for name, first in (("Depth", -0.015), (f"{kind} 2", -0.0499)):
+        text += f'Extrinsic from "{kind} 1"\t  To\t  "{name}" :\n Rotation Matrix:\n'
         text += f"   1   0   0   \n   0   1   0   \n   0   0   1   \n\n Translation Vector: {first}  0  0  \n\n"
     cameras = read_cameras(written(tmp_path, text, "realsense.txt"))
     assert [(c.name, c.size) for c in cameras] == [
-        (f"Infrared {n}", size) for n in (1, 2) for size in ((848, 480), (640, 480))
+        (f"{kind} {n}", size) for n in (1, 2) for size in ((848, 480), (640, 480))
     ]
-    rig, lenses = rig_of(cameras[1], cameras[3])
-    assert (rig.left, rig.baseline, lenses) == (Camera(320, 320, 320, 240, 640, 480), 0.0499, None)
+    rig, _ = rig_of(cameras[1], cameras[3])
+    assert rig.baseline == 0.0499
+    assert {not camera.lens.ideal and camera.lens.model for camera in cameras} == {lens}
+    assert cameras[1].lens.camera == Camera(320, 320, 320, 240, 640, 480)
 
 
 def test_both_cameras_as_camera_calibrator_prints_them(tmp_path):
