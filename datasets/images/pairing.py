@@ -169,6 +169,12 @@ COUNTER = re.compile(r"(\d{3,})\D*$")
 """The last number of a name, of three digits or more."""
 
 
+TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:]?)([0-5]\d)\2[0-5]\d(\d{3})?(?!\d)")
+"""Hours, minutes and seconds in a name, perhaps with milliseconds."""
+
+HEXADECIMAL = re.compile(r"[0-9a-f]+", re.I)
+
+
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part)
@@ -192,12 +198,23 @@ def _ascending(stems: Sequence[str]) -> list[str]:
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in whole]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
-    return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
+    # Of hexadecimal numbers of one length 00a follows 009.
+    head, tail = (len(os.path.commonprefix(words)) for words in (stems, [stem[::-1] for stem in stems]))
+    alike = len(set(map(len, stems))) == 1 and all(HEXADECIMAL.fullmatch(s[head : len(s) - tail] or "0") for s in stems)
+    return sorted(stems, key=lambda stem: (by_stem[stem], natural("" if alike else stem), stem.lower()))
 
 
 def _begun_anew(ordered: Sequence[str]) -> int:
     """Index, in ordered names, of the image taken first, if a counter has reached its last number (999) and gone on
-    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; else 0."""
+    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; or if times of day without a
+    date have passed midnight; else 0."""
+    days = [found for name in ordered if (found := TIME_OF_DAY.search(undated(name)))]
+    if len(days) == len(ordered) and len({found.string[: found.start()] for found in days}) == 1:
+        minutes = [60 * int(found[1]) + int(found[3]) for found in days]
+        gaps = np.diff(minutes)
+        # Ten minutes before and after midnight; half a day without images.
+        midnight = minutes[0] < 10 and minutes[-1] >= 24 * 60 - 10 and max(gaps) > 12 * 60
+        return int(np.argmax(gaps)) + 1 if midnight else 0
     digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
     if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
         return 0
