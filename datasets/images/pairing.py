@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import string
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -172,8 +173,6 @@ COUNTER = re.compile(r"(\d{3,})\D*$")
 TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:]?)([0-5]\d)\2[0-5]\d(\d{3})?(?!\d)")
 """Hours, minutes and seconds in a name, perhaps with milliseconds."""
 
-HEXADECIMAL = re.compile(r"[0-9a-f]+", re.I)
-
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
     """Sorting key in which numbers count as numbers: ``a2`` before ``a10``."""
@@ -199,8 +198,8 @@ def _ascending(stems: Sequence[str]) -> list[str]:
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in whole]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
     # Of hexadecimal numbers of one length 00a follows 009.
-    head, tail = (len(os.path.commonprefix(words)) for words in (stems, [stem[::-1] for stem in stems]))
-    alike = len(set(map(len, stems))) == 1 and all(HEXADECIMAL.fullmatch(s[head : len(s) - tail] or "0") for s in stems)
+    changing = {c for letters in zip(*stems, strict=False) if len(set(letters)) > 1 for c in letters}
+    alike = len(set(map(len, stems))) == 1 and changing <= set(string.hexdigits)
     return sorted(stems, key=lambda stem: (by_stem[stem], natural("" if alike else stem), stem.lower()))
 
 
