@@ -269,7 +269,7 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
     are two frames of A and of B.
     ``timed``: time stamps in the names aside, which may differ between the cameras.
     """
-    found = []
+    found, numbered = list[dict[str, list[int]]](), list[dict[str, list[int]]]()
     words = [re.split(r"([^\W_]+)", STAMP.sub("", undated(name)) if timed else name) for name in names]
     places = range(1, min(map(len, words), default=0), 2)
     halves = {k: [w[k] == words[0][k] for w in words] for k in places if len({w[k] for w in words}) == 2}
@@ -283,9 +283,10 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
         rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
         cameras = all(CAMERA_NUMBER.search("".join(split[: k + 1])) for split in words)
         if rest[0] == rest[1] and (len(rest[0]) > 1 or cameras or (timed and min(map(len, parts.values())) > 1)):
-            found.append((parts, cameras))
-    named = [parts for parts, _ in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
-    found = ([parts for parts, cameras in found if cameras] or named) if found[1:] else [parts for parts, _ in found]
+            found.append(parts)
+            numbered += [parts] if cameras else []
+    named = [parts for parts in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
+    found = numbered or named if found[1:] else found
     return found[0] if len(found) == 1 else {}
 
 

@@ -56,9 +56,10 @@ def mixed(images: list[AnyArray]) -> list[int]:
     """
     if not _comparable(images):
         return []
-    factor = max(1, round(images[0].shape[1] / 400))
-    fine = _details(images, factor)
-    coarse = np.stack([cv2.blur(image, (3, 3)) for image in _details(images, factor, 11)])
+    size = tuple(side // max(1, round(images[0].shape[1] / 400)) for side in reversed(images[0].shape))
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+    fine = _details(small, 1)
+    coarse = np.stack([cv2.blur(image, (3, 3)) for image in _details(small, 1, 11)])
     powers, found = [_blocks(one * one) for one in fine], []
     for k in range(1, len(fine) - 1):
         moves = np.minimum(powers[k - 1], powers[k + 1]) > 0.25 * np.median(powers[k - 1])

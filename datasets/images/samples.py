@@ -81,8 +81,10 @@ def examined(sequence: Sequence) -> Sequence:
 
 def _mixed(sequence: Sequence, there: list[int]) -> list[str]:
     """A line if some of a few successive left images are sums of their neighbours; ``there``: frames with images."""
-    first = max(0, (len(there) - SUCCESSIVE) // 2)
-    frames = there[first : first + SUCCESSIVE]
+    # Videos are no larger.
+    few = SUCCESSIVE if sequence.rig.left.width * sequence.rig.left.height < 10e6 else 0
+    first = max(0, (len(there) - few) // 2)
+    frames = there[first : first + few]
     sums = mixed([image for k in frames for image in _images(sequence.image(k, "left"))])
     if not sums:
         return []
