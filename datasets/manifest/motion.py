@@ -312,12 +312,11 @@ class MotionReader:
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: model.PoseFile | model.Attitude, times: Sequence[float], table: str) -> None:
-        """Refuse rows that mostly are more than ``max_gap``, s, apart about the pairs, so that nothing can be
-        interpolated."""
+        """Refuse rows that are more than ``max_gap``, s, apart about all pairs, so that nothing can be interpolated."""
         rows = np.array(times)
         after = np.searchsorted(rows, self.sequence.times or ())
         after = after[(after > 0) & (after < len(rows))]
-        spacing = float(np.median(rows[after] - rows[after - 1])) if len(after) else 0.0
+        spacing = float(np.min(rows[after] - rows[after - 1], initial=np.inf)) if len(after) else 0.0
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"
