@@ -442,8 +442,13 @@ def _counts(rows: Sequence[Sequence[str]]) -> bool:
 def _plane(poses: Poses, T_body_left: RigidTransform) -> dict[str, list[float]]:
     """Of poses of a body that never rolls or pitches, as by wheels: ``up`` of its plane, and the body's ``origin`` [m],
     in the left camera's frame; else empty. Heights beside it, as by a barometer, are along no axis of the body."""
-    ups = np.array([pose.rotation[2] for pose in poses if pose is not None])
-    if len(ups) < 2 or np.ptp(ups, axis=0).max() > 1e-6:
-        return {}
+    known = [pose for pose in poses if pose is not None]
+    turns = np.array([pose.rotation for pose in known])
     origin = T_body_left.inverse().translation
-    return {"up": ups[0].tolist(), "origin": origin.tolist()}
+    heights = [pose.apply(origin)[2] for pose in known]
+    if len(known) < 2 or np.ptp(turns[:, 2], axis=0).max() > 1e-6:
+        return {}
+    # Rotations that never change and heights that do are those of a program that states no rotations.
+    if np.ptp(heights) > 1e-6 and np.ptp(turns, axis=0).max() < 1e-6:
+        return {}
+    return {"up": turns[0, 2].tolist(), "origin": origin.tolist()}

@@ -912,6 +912,7 @@ sigma_deg = 0.5
         ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0,5", True),
         ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0.01,5", False),
         ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,5", True),  # z of a barometer
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,0", False),  # no rotations
     ],
 )
 def test_odometry_that_never_rolls_or_pitches_measures_neither_slopes_nor_tilts(tmp_path, names, last, plane):
