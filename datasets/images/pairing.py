@@ -38,7 +38,8 @@ SIDES: tuple[tuple[str, str], ...] = (
     *((f"{name}{mark}0", f"{name}{mark}1") for name in ("cam", "camera") for mark in ("", "_", "-")),
     *((f"{name}0", f"{name}1") for name in ("image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
-    *((f"{name}1", f"{name}2") for name in ("infra", "i")),
+    *((f"{name}1", f"{name}2") for kind in ("infra", "infrared", "ir") for name in (kind, f"{kind}_", f"{kind}-")),
+    ("i1", "i2"),
     ("lcam", "rcam"),
     ("l", "r"),
 )

@@ -22,7 +22,7 @@ from rille.stages.geometry.lens import Lens
 
 TRANSPOSED = "it is transposed"
 EXCHANGED = "those of left and right are exchanged"
-RECTIFIED = "the images are rectified already: give the calibration of rectified images (P)"
+RECTIFIED = "the images are rectified already: state images.rectified = true, with a calibration that has their P"
 MIN_RATIO, MAX_RATIO = 1.005, 1.25
 """Ratios of a focal length to the given one between which it is misread: less is the error of a usual calibration;
 beyond, images hardly match."""

@@ -73,6 +73,7 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         ([f"image_{c}/{k}.png" for c in range(4) for k in (1, 2)], "image_0/*.png", "image_1/*.png", 2),
         (["im0.png", "im1.png"], "im0.png", "im1.png", 1),
         (["infra1/7.png", "infra2/7.png"], "infra1/7.png", "infra2/7.png", 1),
+        ([f"{c}_{k}.png" for c in ("ir1", "ir2", "rgb") for k in (1, 2)], "ir1_*.png", "ir2_*.png", 2),
         ([*both("{side}/{name}.png", ["1", "2"]), "left/9.jpg", "right/9.jpg"], "left/*.png", "right/*.png", 2),
         (both("{side}/{name}", ["1.png", "2.PNG"]), "left/*.png", "right/*.png", 2),
         ([f"{side}/{k}.png" for side in ("droite", "gauche") for k in (1, 2)], "gauche/*.png", "droite/*.png", 2),
