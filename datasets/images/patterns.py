@@ -58,6 +58,8 @@ def mixed(images: list[AnyArray]) -> list[int]:
         return []
     size = tuple(side // max(1, round(images[0].shape[1] / 400)) for side in reversed(images[0].shape))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+    if not _comparable(small):
+        return []
     fine = _details(small, 1)
     coarse = np.stack([cv2.blur(image, (3, 3)) for image in _details(small, 1, 11)])
     powers, found = [_blocks(one * one) for one in fine], []
@@ -70,7 +72,7 @@ def mixed(images: list[AnyArray]) -> list[int]:
         inside = np.repeat(np.repeat(moves, BLOCK, 0), BLOCK, 1)
         before, here, after = (one[: len(inside), : inside.shape[1]][inside] for one in fine[k - 1 : k + 2])
         parts, left, *_ = np.linalg.lstsq(np.stack([before, after], axis=1), here, rcond=None)
-        # Of true images at most 0.1 of the detail is explained, or by parts of 1.2 and more in sum, or by one of them.
+        # Of true images less of the detail is explained, mostly none of it, or by parts of more in sum, or by one.
         if moves.mean() > 0.05 and parts.min() > 0.3 and parts.sum() < 1.2 and left.sum() < 0.25 * (here**2).sum():
             found.append(k)
     return found

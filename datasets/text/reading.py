@@ -60,6 +60,8 @@ POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
 """Beginnings of files that Git LFS and git-annex leave in place of their content."""
 
 WILD = re.compile(r"[*?\[]")
+FOREIGN = re.compile(r"\\|%\d*d")
+"""In paths as Windows and ffmpeg write them."""
 HIDDEN = re.compile(r"\.(?!\d+\.)")  # .25.png is a number
 
 
@@ -110,7 +112,7 @@ def missing_target(path: str | Path, name: str = "it") -> str:
 
 def meant(path: Path) -> str:
     """What may be meant by the path, or pattern, of a missing file, as the beginning of a remedy; empty: unknown."""
-    if "\\" in str(path) or "%" in str(path):
+    if FOREIGN.search(str(path)):
         return "write / between folders, not \\, and * for a number that changes, not %06d; "
     for part in reversed((path, *path.parents[:-1])):
         if WILD.search(part.name):

@@ -128,6 +128,7 @@ def test_sums_of_neighbours_are_told_from_views_of_their_own(tmp_path, period, s
     views = [scene[:, step * k : step * k + 192] + random.normal(0, 2, (160, 192)) for k in range(9)]
     sums = range(2, 8, period) if period else ()
     shown = [(views[k - 1] + views[k + 1]) / 2 if k in sums else view for k, view in enumerate(views)]
+    assert mixed([cv2.resize(view, (4000, 64)) for view in shown]) == []  # a strip has no blocks
     told = mixed(shown)
     assert told == (list(sums) if step else [])
     path = write_sequence(tmp_path, frames=9)
