@@ -24,7 +24,7 @@ from rille.datasets.text.columns import meanings
 from rille.datasets.text.tables import TextTable, read_table
 from rille.datasets.text.units import FORCES, RATES, unitless
 from rille.stages.core.arrays import Bools, Floats
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, warning
 from rille.stages.geometry.geometry import RigidTransform, orthonormal, rotation_exp
 
 Up = Vector | None
@@ -39,6 +39,9 @@ HALF_WINDOW = 1.0
 """s; the force is averaged over this time before and after a frame, at an end of the record on one side. In a drone's
 flight one frame in twenty passes, with errors of 0.6 degrees in the median and at most 2; half the window triples that.
 """
+
+GRAVITY, MAX_OFF_GRAVITY = 9.81, 0.2
+"""m/s^2: 9.78 to 9.83 on the ground; accelerometers of drones are biased by up to 0.1."""
 
 GYROSCOPE = re.compile(r"(.*[./])?(gyr|g_?[xyz]\b|w_|w[xyz]|ang(?!.*cov)|omega|rate)")
 ACCELEROMETER = re.compile(r"(.*[./])?(acc|alpha_|a_|a[xyz]|lin(?!.*cov)|force)")
@@ -208,8 +211,7 @@ def unaccelerated(force: Floats, spread: Floats, rate: Floats) -> Bools:
 
     ``spread`` (..., 3): standard deviation of its means over 0.1 s; ``rate`` (..., 3): mean rate, rad/s.
     """
-    # 9.81 m/s^2: 9.78 to 9.83 on the ground; accelerometers of drones are biased by up to 0.1.
-    level = np.abs(np.linalg.norm(force, axis=-1) - 9.81) <= 0.2
+    level = np.abs(np.linalg.norm(force, axis=-1) - GRAVITY) <= MAX_OFF_GRAVITY
     # The force of an accelerated body varies; that of a turning sensor has a centrifugal part; at rest cheap sensors
     # have a rate of 0.08.
     return np.asarray(level & (spread.max(axis=-1) <= 0.2) & (np.linalg.norm(rate, axis=-1) <= 0.15))
@@ -246,6 +248,10 @@ def at_frames(imu: ImuRecord, at: Sequence[float], T_imu_left: RigidTransform) -
         seen = None if force is None else R_imu_left.T @ force
         up.append(None if seen is None else vector_of(seen / np.linalg.norm(seen)))
     warnings = (*imu.warnings, *coverage(attitude, at, f"attitude from {imu.name}"))
+    usual = float(np.median(np.linalg.norm(imu.forces, axis=1)))
+    if not any(up) and abs(usual - GRAVITY) > MAX_OFF_GRAVITY:
+        text = f"{imu.name} gives no vertical: its accelerations are {usual:.2f} m/s^2 (median), gravity's {GRAVITY}"
+        warnings += (warning("RIL-850", f"{text}: calibrate their scale and bias, or state world.up"),)
     return Inertial(tuple(attitude), tuple(up), rows_of(R_imu_left), warnings, notes)
 
 

@@ -57,6 +57,9 @@ WITHIN = 1e-6
 NOT_IN_PLANE = re.compile(r"\b(lat|lon)|ecef")
 """Part of names of columns in degrees, and of coordinates from the Earth's centre."""
 
+HEADING = re.compile(r"(?<![a-z])(head(ing)?|hdg|course|cog|bearing|azimuth|orientation|direction|angle|psi)(?![a-z])")
+"""Part of names of columns that may be a yaw, of which they do not tell the sense and the beginning."""
+
 DOWNWARDS = re.compile(r"(.*[./])?(down|depth)")
 """Names of columns of z that count downwards, as in NED frames and for vehicles under water."""
 
@@ -200,7 +203,7 @@ class TimedPositions:
 
 
 def positions_of(
-    table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None
+    table: TextTable, format: str, columns: Mapping[Any, str | int], unit: float | None = None, *, held: bool = False
 ) -> TimedPositions | None:
     """Positions of a table without rotations; None if the file holds poses.
 
@@ -210,6 +213,7 @@ def positions_of(
     columns : name or number (from 1) of ``time``, ``x``, ``y``, ``z``, unless the table's names are clear; with any of
         them the table is one of positions.
     unit : as for :func:`poses_of`.
+    held : rows that repeat the last measurement are left out, where a log is faster than its sensor.
 
     Raises
     ------
@@ -241,7 +245,8 @@ def positions_of(
     timed = [meant["time"]] if "time" in meant else []
     named, warnings = not timed and bool(np.isinf(table.values([0])).all()), tuple[str, ...]()
     if timed or named:  # else rows are pairs
-        table, left_out = table.measured([*timed, *placed], _without_fix(table, *placed[:2]))
+        lost = _without_fix(table, *placed[:2])
+        table, left_out = table.measured([*timed, *placed], lost | _held(table.values(placed)) if held else lost)
         warnings += left_out
     rows = _lengths(table, placed, unit)
     warnings += _rounded(rows, table.name)
@@ -272,6 +277,13 @@ def _without_fix(table: TextTable, x: int, y: int) -> AnyArray:
     return np.asarray(none | ((away == 0) & bool(away[away > 0].min(initial=np.inf) > 1000.0)))
 
 
+def _held(values: Floats) -> Bools:
+    """Rows (n,) of values (n, k) that are those of the row before; none unless most values stand in several rows."""
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    lengths = np.diff(np.flatnonzero(np.append(~same, True)))
+    return np.asarray(same & (len(lengths) > 2 and np.median(lengths) >= 2))
+
+
 def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     """Times of a column (:func:`rille.datasets.text.times.seconds`), in the unit of its name."""
     stamps, stated = table.text(column), table.unit(column)
@@ -289,8 +301,11 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
+            heading = next((name for name in table.header if HEADING.search(name)), "")
+            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading}"
+            hint = f"{hint} if it is counter-clockwise from x; else " if heading else ""
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
-            raise InputError("RIL-801", text, remedy=remedy)
+            raise InputError("RIL-801", text, remedy=hint + remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     frames = by_name.untimed(table)
     bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])

@@ -27,7 +27,7 @@ from rille.datasets.mockup.rover import RoverParams
 from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import shell_word
-from rille.datasets.text.reading import Search, missing_target
+from rille.datasets.text.reading import WILD, Search, missing_target
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean
 
@@ -178,7 +178,8 @@ def _refuse_missing(name_or_path: str) -> None:
     """
     if not is_there(name_or_path):
         path, known = _split(name_or_path)[0], [*BUILT_IN, *MANIFESTS]
-        meant = did_you_mean(name_or_path, known) or "give a folder or a manifest, or"
+        form = "remove its quotes" if WILD.search(name_or_path) else "give a folder or a manifest"
+        meant = did_you_mean(name_or_path, known) or f"{form}, or"
         remedy = missing_target(path) or f"{meant} known names: {', '.join(known)}"
         kind = "file" if path.suffix else "sequence"
         raise InputError("RIL-276", f"no {kind} {name_or_path!r:.200}", remedy=remedy)

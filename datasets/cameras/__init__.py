@@ -47,7 +47,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
     (states(r"'lensmodel'"), slam.mrcal),
-    (lambda text: 'Intrinsic of "Infrared 1"' in text, makers.realsense),
+    (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
     (lambda text: bool(makers.numbers_of_matrix(text)), makers.matrix),
 )
@@ -56,7 +56,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
-    (lambda f: any(isinstance(f.values[key], dict) for key in f.values if slam.CAMERA.fullmatch(key)), slam.kalibr),
+    (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),
     (lambda f: "cam0_calib" in f, slam.vins),

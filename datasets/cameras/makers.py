@@ -122,23 +122,25 @@ def _to_root(sockets: Fields, socket: str) -> tuple[str, RigidTransform]:
     return socket, T
 
 
-INFRARED = re.compile(r'Intrinsic of[ \t]+"Infrared ([12])".*\n((?:[ \t]*[A-Z]\w+[^:\n]*:.*\n?)+)')
-RELATIVE = re.compile(r'from[ \t]+"Infrared 1"[ \t]+To[ \t]+"Infrared 2"[^-\d]*([-+.\de\s]+)Translation[^:]*:([^\n]*)')
-"""Of a RealSense's list: an infrared camera with its entries, and R and T of ``x_right = R x_left + T``, metres."""
+LISTED = re.compile(r'Intrinsic of[ \t]+"((?:Infrared|Fisheye) ([12]))".*\n((?:[ \t]*[A-Z]\w+[^:\n]*:.*\n?)+)')
+RELATIVE = re.compile(
+    r'from[ \t]+"(Infrared|Fisheye) 1"[ \t]+To[ \t]+"\1 2"[^-\d]*([-+.\de\s]+)Translation[^:]*:([^\n]*)'
+)
+"""Of a RealSense's list: a camera of the pair with its entries, and R and T of ``x_right = R x_left + T``, metres."""
 
 
 def realsense(text: str, path: Path) -> list[CalibratedCamera]:
-    """The infrared cameras at each resolution, as ``rs-enumerate-devices -c`` prints them."""
+    """The infrared cameras at each resolution, or the fisheye ones, as ``rs-enumerate-devices -c`` prints them."""
     cameras = {}
     placed = RELATIVE.search(text)
-    R, T = (part.split() for part in placed.groups()) if placed else (None, None)
-    for number, body in INFRARED.findall(text):
+    R, T = (part.split() for part in placed.groups()[1:]) if placed else (None, None)
+    for name, number, body in LISTED.findall(text):
         rows = ((key.lower(), value.split()) for key, value in re.findall(r"(\w+)[^:\n]*:(.*)", body))
         stated = {key: row if key == "coeffs" else " ".join(row) for key, row in rows}
-        f = Fields({**stated, "R": R, "T": T}, str(path), f"Infrared {number} ")
+        f = Fields({**stated, "R": R, "T": T}, str(path), f"{name} ")
         camera = f.optics("fx fy ppx ppy", f.size("width", "height"), "none").camera
         pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
-        name, lens = f"Infrared {number}", f.distorted("coeffs", camera)
+        lens = f.distorted("coeffs", camera)
         cameras[number, camera.width, camera.height] = CalibratedCamera(name, lens, pose)
     return list(cameras.values())
 

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields, by_count
+from rille.datasets.cameras.fields import Fields, by_count, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
+from rille.datasets.images.pairing import natural
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-CAMERA = re.compile(r"cam(\d+)")
+BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C")
+"""Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS."""
 
 BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
 """Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
@@ -32,29 +34,39 @@ MRCAL = re.compile(r"'(\w+)'[ \t]*:[ \t]*(?:'(\w+)'|\[([^][]*)\])")
 """An entry of mrcal's: a name, or a list."""
 
 
+def chain(f: Fields) -> list[str]:
+    """Names of parts that are cameras, by their names or by optics in four numbers, in natural order."""
+    parts = ((key, value) for key, value in f.values.items() if isinstance(value, Mapping))
+    listed = (k for k, of in parts if re.fullmatch(r"cam\d+", k) or len(flattened(of.get("intrinsics")) or ()) == 4)
+    return sorted(listed, key=natural)
+
+
 def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of a chain: ``T_cn_cnm1`` maps camera n - 1 to camera n, metres.
 
-    If not all have it, poses are those against the IMU, by ``T_cam_imu`` or its inverse ``T_imu_cam`` (OpenVINS).
+    If not all have it, poses are those against the IMU or the body, by ``T_cam_imu`` or one of :data:`BODY_CAMERA`.
     """
-    names = sorted((key for key in f.values if CAMERA.fullmatch(key)), key=lambda key: int(key[3:]))
+    names = chain(f)
     parts = [f.sub(name) for name in names]
     whole = len(parts) > 1 and all("T_cn_cnm1" in part for part in parts[1:])
-    poses = [RigidTransform.identity() if whole else _of_imu(parts[0])]
+    poses = [RigidTransform.identity() if whole else _of_body(parts[0])]
     for part in parts[1:]:
-        T, before = (None if whole else _of_imu(part)), poses[-1]
+        T, before = (None if whole else _of_body(part)), poses[-1]
         # Each pose is relative to the camera before, so that poses multiply along the chain.
         poses.append(part.pose("T_cn_cnm1") @ before if T is None and before and "T_cn_cnm1" in part else T)
+    for part, T in zip(parts, poses, strict=True):
+        if T is None:
+            part.check_turn()
     return [
-        CalibratedCamera(name, _pinhole_lens(part, "distortion_coeffs"), T)
+        CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)
         for name, part, T in zip(names, parts, poses, strict=True)
     ]
 
 
-def _of_imu(part: Fields) -> RigidTransform | None:
+def _of_body(part: Fields) -> RigidTransform | None:
     if "T_cam_imu" in part:
         return part.pose("T_cam_imu")
-    return part.pose("T_imu_cam").inverse() if "T_imu_cam" in part else None
+    return part.pose(key).inverse() if (key := part.spelt(BODY_CAMERA)) in part else None
 
 
 def camodocal(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import string
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -37,7 +38,8 @@ SIDES: tuple[tuple[str, str], ...] = (
     *((f"{name}{mark}0", f"{name}{mark}1") for name in ("cam", "camera") for mark in ("", "_", "-")),
     *((f"{name}0", f"{name}1") for name in ("image_", "image_0", "im", "view")),
     *((f"{name}2", f"{name}3") for name in ("image_", "image_0")),
-    *((f"{name}1", f"{name}2") for name in ("infra", "i")),
+    *((f"{name}1", f"{name}2") for kind in ("infra", "infrared", "ir") for name in (kind, f"{kind}_", f"{kind}-")),
+    ("i1", "i2"),
     ("lcam", "rcam"),
     ("l", "r"),
 )
@@ -162,8 +164,15 @@ def writable(name: str) -> None:
         raise InputError("RIL-185", text, remedy="rename it")
 
 
+CAMERA_NUMBER = re.compile(r"(?<![a-z])cam(era)?[_-]?\d+$", re.I)
+"""End of a name that numbers a camera, any two numbers of which are two cameras."""
+
 COUNTER = re.compile(r"(\d{3,})\D*$")
 """The last number of a name, of three digits or more."""
+
+
+TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:]?)([0-5]\d)\2[0-5]\d(\d{3})?(?!\d)")
+"""Hours, minutes and seconds in a name, perhaps with milliseconds."""
 
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:
@@ -189,12 +198,23 @@ def _ascending(stems: Sequence[str]) -> list[str]:
     alike = len(numbers) == len(stems) and len({(match[1], match[3]) for match in found if match}) == 1
     values = numbers if alike and not counts else [stamp_of(stem) or "0" for stem in whole]
     by_stem = dict(zip(stems, map(Decimal, values), strict=True))
-    return sorted(stems, key=lambda stem: (by_stem[stem], natural(stem)))
+    # Of hexadecimal numbers of one length 00a follows 009.
+    changing = {c for letters in zip(*stems, strict=False) if len(set(letters)) > 1 for c in letters}
+    alike = len(set(map(len, stems))) == 1 and changing <= set(string.hexdigits)
+    return sorted(stems, key=lambda stem: (by_stem[stem], natural("" if alike else stem), stem.lower()))
 
 
 def _begun_anew(ordered: Sequence[str]) -> int:
     """Index, in ordered names, of the image taken first, if a counter has reached its last number (999) and gone on
-    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; else 0."""
+    from 0, or from 1 as in cameras (DCF), so that more numbers are missing than present; or if times of day without a
+    date have passed midnight; else 0."""
+    days = [found for name in ordered if (found := TIME_OF_DAY.search(undated(name)))]
+    if len(days) == len(ordered) and len({found.string[: found.start()] for found in days}) == 1:
+        minutes = [60 * int(found[1]) + int(found[3]) for found in days]
+        gaps = np.diff(minutes)
+        # Ten minutes before and after midnight; half a day without images.
+        midnight = minutes[0] < 10 and minutes[-1] >= 24 * 60 - 10 and max(gaps) > 12 * 60
+        return int(np.argmax(gaps)) + 1 if midnight else 0
     digits = [found[1] for name in ordered if (found := COUNTER.search(name))]
     if len(digits) < len(ordered) or len(set(map(len, digits))) != 1:
         return 0
@@ -246,10 +266,11 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
     """Indices of names by the two words that distinguish names of pairs, as A/07 and B/07, or A/X_07 and B/Y_07.
 
     In natural order of the words; empty unless exactly one position of words does so, those that repeat it aside. Of
-    several one whose words differ by more than a number is taken: A/0, A/1, B/0 and B/1 are two frames of A and of B.
+    several one that numbers cameras is taken, or one whose words differ by more than a number: A/0, A/1, B/0 and B/1
+    are two frames of A and of B.
     ``timed``: time stamps in the names aside, which may differ between the cameras.
     """
-    found = []
+    found, numbered = list[dict[str, list[int]]](), list[dict[str, list[int]]]()
     words = [re.split(r"([^\W_]+)", STAMP.sub("", undated(name)) if timed else name) for name in names]
     places = range(1, min(map(len, words), default=0), 2)
     halves = {k: [w[k] == words[0][k] for w in words] for k in places if len({w[k] for w in words}) == 2}
@@ -261,10 +282,12 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
         kinds = sorted({split[k] for split in words}, key=natural)
         parts = {kind: [i for i, split in enumerate(words) if split[k] == kind] for kind in kinds}
         rest = [{tuple(w for j, w in enumerate(words[i]) if j not in repeated) for i in of} for of in parts.values()]
-        if rest[0] == rest[1] and (len(rest[0]) > 1 or (timed and min(map(len, parts.values())) > 1)):
+        cameras = all(CAMERA_NUMBER.search("".join(split[: k + 1])) for split in words)
+        if rest[0] == rest[1] and (len(rest[0]) > 1 or cameras or (timed and min(map(len, parts.values())) > 1)):
             found.append(parts)
+            numbered += [parts] if cameras else []
     named = [parts for parts in found if len({re.sub(r"\d+", "", word) for word in parts}) == 2]
-    found = named if found[1:] else found
+    found = numbered or named if found[1:] else found
     return found[0] if len(found) == 1 else {}
 
 

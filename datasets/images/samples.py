@@ -13,7 +13,7 @@ from PIL import Image
 
 from rille.datasets.images import files
 from rille.datasets.images.headers import orientation
-from rille.datasets.images.patterns import fixed_pattern, overlaid
+from rille.datasets.images.patterns import fixed_pattern, mixed, overlaid
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.stages.core.declare import AnyArray, declared
 from rille.stages.core.errors import InputError, RilleError, warning
@@ -21,6 +21,9 @@ from rille.stages.imaging import levels
 
 FORMATS = ("JPEG", "TIFF", "PNG")
 """Pillow's names of formats with tags, or with several images in a file."""
+
+SUCCESSIVE = 8
+"""Left images in a row that are compared: of five, conversions of 24 to 30 frames a second mix one to four."""
 
 BLOCK = 16
 """Side of a block, in cells of 2 x 2 pixels, whose four phases are compared."""
@@ -61,6 +64,7 @@ def examined(sequence: Sequence) -> Sequence:
         if any(map(interlaced, of)):
             text = f"rows of {camera} images differ by turns, as of two moments: deinterlace them (ffmpeg -vf bwdif)"
             lines.append(warning("RIL-832", text))
+    lines += _mixed(sequence, there)
     chosen_levels = levels.levels_of_sides(*images.values())
     if not any(chosen_levels):
         return replace(sequence, warnings=(*sequence.warnings, *lines))
@@ -73,6 +77,20 @@ def examined(sequence: Sequence) -> Sequence:
         return replace(source, args={**source.args, "levels": used}) if deep else source
 
     return replace(sequence, image=image, warnings=(*sequence.warnings, *lines))
+
+
+def _mixed(sequence: Sequence, there: list[int]) -> list[str]:
+    """A line if some of a few successive left images are sums of their neighbours; ``there``: frames with images."""
+    # Videos are no larger.
+    few = SUCCESSIVE if sequence.rig.left.width * sequence.rig.left.height < 10e6 else 0
+    first = max(0, (len(there) - few) // 2)
+    frames = there[first : first + few]
+    sums = mixed([image for k in frames for image in _images(sequence.image(k, "left"))])
+    if not sums:
+        return []
+    text = f"{len(sums)} of {len(frames)} left images from frame {frames[0]} on are sums of their neighbours, as a "
+    remedy = "take the images out of the recording itself, as they were taken"
+    return [warning("RIL-836", f"{text}conversion of the frame rate makes them; their poses are wrong: {remedy}")]
 
 
 def _images(source: Source) -> list[AnyArray]:

@@ -101,8 +101,11 @@ def _of_both_sides(groups: Sets) -> Sets:
 
 def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list[Path]]:
     """Images by the one word in which the names of two cameras differ; empty if tokens tell more, or no word does."""
-    # Tokens that make single pairs may be numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
-    if any(min(map(len, sides)) > 1 for sides in both.values()):
+    # Tokens that make single pairs, and numbers that leave images over or stand in folders of numbered cameras, may be
+    # numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
+    numbers = sum(len(of) for sides in both.values() for of in sides) < len(images)
+    numbers |= all(pairing.CAMERA_NUMBER.search(name.rpartition("/")[0]) for name in names)
+    if any(min(map(len, of)) > 1 and not (numbers and pairing.SIDES[k][0][-1] == "0") for (k, _), of in both.items()):
         return {}
     words = pairing.by_one_word(names) or pairing.by_one_word(names, timed=True)
     parts = {word: [images[i] for i in of] for word, of in words.items()}

@@ -312,8 +312,11 @@ class MotionReader:
         return protocol.Positions(rows, times, section.max_gap, lever)
 
     def refuse_sparse(self, section: model.PoseFile | model.Attitude, times: Sequence[float], table: str) -> None:
-        """Refuse rows that mostly are more than ``max_gap``, s, apart, so that nothing can be interpolated."""
-        spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        """Refuse rows that are more than ``max_gap``, s, apart about all pairs, so that nothing can be interpolated."""
+        rows = np.array(times)
+        after = np.searchsorted(rows, self.sequence.times or ())
+        after = after[(after > 0) & (after < len(rows))]
+        spacing = float(np.min(rows[after] - rows[after - 1], initial=np.inf)) if len(after) else 0.0
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"
@@ -373,7 +376,7 @@ class MotionReader:
             pairs.
         """
         table = self.table(section.file)
-        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit)
+        found = positions_of(table, "auto", section.columns or columns_of_places(table), section.unit, held=True)
         if found is None:
             text = f"positions.file: {section.file} holds poses, or columns without names"
             raise InputError("RIL-453", text, remedy="say which are meant: columns = { time = 1, x = 2, y = 3, z = 4 }")
@@ -437,12 +440,15 @@ def _counts(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def _plane(poses: Poses, T_body_left: RigidTransform) -> dict[str, list[float]]:
-    """Of poses of a body that never leaves a plane, as of wheels: ``up`` of the plane, and the body's ``origin`` [m],
-    in the left camera's frame; else empty."""
+    """Of poses of a body that never rolls or pitches, as by wheels: ``up`` of its plane, and the body's ``origin`` [m],
+    in the left camera's frame; else empty. Heights beside it, as by a barometer, are along no axis of the body."""
     known = [pose for pose in poses if pose is not None]
-    ups = np.array([pose.rotation[2] for pose in known])
+    turns = np.array([pose.rotation for pose in known])
     origin = T_body_left.inverse().translation
     heights = [pose.apply(origin)[2] for pose in known]
-    if len(known) < 2 or np.ptp(ups, axis=0).max() > 1e-6 or np.ptp(heights) > 1e-6:
+    if len(known) < 2 or np.ptp(turns[:, 2], axis=0).max() > 1e-6:
         return {}
-    return {"up": ups[0].tolist(), "origin": origin.tolist()}
+    # Rotations that never change and heights that do are those of a program that states no rotations.
+    if np.ptp(heights) > 1e-6 and np.ptp(turns, axis=0).max() < 1e-6:
+        return {}
+    return {"up": turns[0, 2].tolist(), "origin": origin.tolist()}

@@ -13,13 +13,14 @@ import stat
 import tomllib
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BufferedReader
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 from rille.datasets.images.kinds import hints
-from rille.stages.core.errors import InputError
+from rille.stages.core.errors import InputError, did_you_mean
 
 SMALL = 1_000_000
 """Bytes of a manifest, a configuration or a calibration, which have kilobytes."""
@@ -59,6 +60,8 @@ POINTERS = (b"version https://git-lfs.github.com/spec/", b"/annex/objects/")
 """Beginnings of files that Git LFS and git-annex leave in place of their content."""
 
 WILD = re.compile(r"[*?\[]")
+FOREIGN = re.compile(r"\\|%\d*d")
+"""In paths as Windows and ffmpeg write them."""
 HIDDEN = re.compile(r"\.(?!\d+\.)")  # .25.png is a number
 
 
@@ -87,7 +90,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
         text = f"{what} {path} cannot be read: {missing_target(path) or reason}"
-        remedy = "name a file in it" if os.path.isdir(path) else "check the path and its rights"
+        remedy = "name a file in it" if os.path.isdir(path) else f"{meant(path)}check the path and its rights"
         raise InputError("RIL-138", text, remedy=remedy) from error
     if status.st_size <= most:
         text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
@@ -105,6 +108,21 @@ def missing_target(path: str | Path, name: str = "it") -> str:
     """That a path, called ``name``, is a link to a missing file, in words; empty: it is none."""
     broken = os.path.islink(path) and not os.path.exists(path)
     return f"{name} is a link to {os.readlink(path)}, which is missing" if broken else ""
+
+
+def meant(path: Path) -> str:
+    """What may be meant by the path, or pattern, of a missing file, as the beginning of a remedy; empty: unknown."""
+    if FOREIGN.search(str(path)):
+        return "write / between folders, not \\, and * for a number that changes, not %06d; "
+    for part in reversed((path, *path.parents[:-1])):
+        if WILD.search(part.name):
+            break
+        if not os.path.lexists(part):
+            with suppress(OSError, ValueError), os.scandir(part.parent) as entries:
+                like = did_you_mean(part.name, [e.name for e in islice(entries, MOST_ENTRIES) if e.name.isprintable()])
+                return f"{like[:-1]}, in {part.parent}? Else " if like else ""
+            break
+    return ""
 
 
 def is_file(path: str | Path) -> bool:

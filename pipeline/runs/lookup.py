@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import events
-from rille.stages.core.errors import ConfigError, RilleError, did_you_mean
-from rille.stages.core.quantities import some
+from rille.stages.core.errors import ConfigError, RilleError, did_you_mean, warning
+from rille.stages.core.quantities import count, some
 
 LEDGER = "ledger.jsonl"
 
@@ -123,3 +124,16 @@ def used(run: Path) -> set[str]:
     with reading(run):
         rows = (row for row in tasks(run).values() if row["status"] in ("computed", "cached"))
         return {str(row["key"]) for row in rows if "key" in row}
+
+
+def shared_images(runs: Iterable[Path]) -> Iterator[str]:
+    """Lines on runs that have images in common, as two of one sequence: what these show would count twice."""
+    images = {run: {row["digest"] for label, row in tasks(run).items() if _is_left_image(label, row)} for run in runs}
+    for (a, ours), (b, theirs) in combinations(images.items(), 2):
+        if both := len(ours & theirs):
+            text = f"{count(both, 'left image')} of {name(b)} are those of {name(a)}, and count twice"
+            yield warning("RIL-848", f"{text}: stated standard deviations are too small")
+
+
+def _is_left_image(label: str, row: Mapping[str, Any]) -> bool:
+    return label.startswith("image/left/") and "digest" in row

@@ -397,9 +397,9 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     a, between = RigidTransform(ROTATION, [0.1, 0.2, 0.3]), RigidTransform(np.eye(3), SHIFT)
     b = between @ a
 
-    def rig(*poses):
+    def rig(*poses, name="cam"):
         text = "".join(
-            f"cam{n}: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512], {key}: "
+            f"{name}{n}: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512], {key}: "
             f"{np.vstack([T.matrix34, [0, 0, 0, 1]]).tolist()}}}\n"
             for n, (key, T) in enumerate(poses)
         )
@@ -413,6 +413,11 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     np.testing.assert_allclose(rig(*mixed), between.matrix34, atol=1e-12)
     expected = (b @ (b.inverse() @ a).inverse()).matrix34
     np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
+    for key in ("T_BS", "T_SC"):
+        found = rig((key, a.inverse()), (key, b.inverse()), name="camera_")
+        np.testing.assert_allclose(found, between.matrix34, atol=1e-12)
+    with raises("RIL-766", "camera_0.T_b"):
+        rig(("T_b", a.inverse()), ("T_b", b.inverse()), name="camera_")
 
 
 def test_kalibr_of_one_camera(tmp_path):
@@ -761,24 +766,30 @@ def test_a_rotation_that_is_not_read_is_refused(tmp_path, turned):
         read_cameras(written(tmp_path, json.dumps(FIGURES | {"rotation": [0, 0.1, 0], "translation": [-0.12, 0, 0]})))
 
 
-def test_a_realsense(tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "model", "k1", "lens"),
+    [("Infrared", "Brown Conrady", 0, False), ("Fisheye", "Kannala Brandt4", -0.005, "fisheye")],
+)
+def test_a_realsense(tmp_path, kind, model, k1, lens):
     def camera(number, width, height):
         figures = f"PPX: \t{width / 2}\n  PPY: \t{height / 2}\n  Fx: \t{width / 2}\n  Fy: \t{width / 2}"
-        lens = "Distortion: \tBrown Conrady\n  Coeffs: \t0  \t0  \t0  \t0  \t0  \n  FOV (deg): \t89.9 x 58.9"
-        head = f'Intrinsic of "Infrared {number}" / {width}x{height} / {{Y8}}'
+        lens = f"Distortion: \t{model}\n  Coeffs: \t{k1}  \t0  \t0  \t0  \t0  \n  FOV (deg): \t89.9 x 58.9"
+        head = f'Intrinsic of "{kind} {number}" / {width}x{height} / {{Y8}}'
         return f" {head}\n  Width: \t{width}\n  Height: \t{height}\n  {figures}\n  {lens}\n\n"
 
     text = "Device info:\n    Name : \tIntel RealSense D435I\n\nIntrinsic Parameters:\n\n"
     text += "".join(camera(n, *size) for n in (1, 2) for size in ((848, 480), (640, 480), (640, 480)))
-    for name, first in (("Depth", -0.015), ("Infrared 2", -0.0499)):
-        text += f'Extrinsic from "Infrared 1"\t  To\t  "{name}" :\n Rotation Matrix:\n'
+    for name, first in (("Depth", -0.015), (f"{kind} 2", -0.0499)):
+        text += f'Extrinsic from "{kind} 1"\t  To\t  "{name}" :\n Rotation Matrix:\n'
         text += f"   1   0   0   \n   0   1   0   \n   0   0   1   \n\n Translation Vector: {first}  0  0  \n\n"
     cameras = read_cameras(written(tmp_path, text, "realsense.txt"))
     assert [(c.name, c.size) for c in cameras] == [
-        (f"Infrared {n}", size) for n in (1, 2) for size in ((848, 480), (640, 480))
+        (f"{kind} {n}", size) for n in (1, 2) for size in ((848, 480), (640, 480))
     ]
-    rig, lenses = rig_of(cameras[1], cameras[3])
-    assert (rig.left, rig.baseline, lenses) == (Camera(320, 320, 320, 240, 640, 480), 0.0499, None)
+    rig, _ = rig_of(cameras[1], cameras[3])
+    assert rig.baseline == 0.0499
+    assert {not camera.lens.ideal and camera.lens.model for camera in cameras} == {lens}
+    assert cameras[1].lens.camera == Camera(320, 320, 320, 240, 640, 480)
 
 
 def test_both_cameras_as_camera_calibrator_prints_them(tmp_path):

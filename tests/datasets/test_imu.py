@@ -148,11 +148,13 @@ def _heavy(t):
     return np.tile([0, 0, 0.3], (len(t), 1))
 
 
-@pytest.mark.parametrize("more", [_brakes, _falls, _heavy])
-def test_no_up_from_an_accelerated_body(more):
+@pytest.mark.parametrize(("more", "said"), [(_brakes, False), (_falls, True), (_heavy, True)])
+def test_no_up_from_an_accelerated_body_or_a_wrong_scale_which_is_said(more, said):
     record = resting(4.0)
     forces = record.forces + more(record.times)
-    assert at_frames(ImuRecord(record.times, record.rates, forces), [2.0], IDENTITY).up == (None,)
+    found = at_frames(ImuRecord(record.times, record.rates, forces), [2.0], IDENTITY)
+    assert found.up == (None,)
+    assert any("RIL-850" in line for line in found.warnings) == said
 
 
 def test_no_up_from_a_body_that_turns_fast():

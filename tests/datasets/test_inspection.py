@@ -59,6 +59,7 @@ def both(template: str, names: list[str]) -> list[str]:
 CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
 CAM_3_4 = "A/cam3/rgb/*.png", "A/cam4/rgb/*.png"
 LEFT_RIGHT = "*/left.png", "*/right.png"
+CAMERA_0_2 = "camera_00/im*.png", "camera_02/im*.png"
 LCAM = "image_lcam/*.png", "image_rcam/*.png"
 
 
@@ -74,6 +75,7 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         ([f"image_{c}/{k}.png" for c in range(4) for k in (1, 2)], "image_0/*.png", "image_1/*.png", 2),
         (["im0.png", "im1.png"], "im0.png", "im1.png", 1),
         (["infra1/7.png", "infra2/7.png"], "infra1/7.png", "infra2/7.png", 1),
+        ([f"{c}_{k}.png" for c in ("ir1", "ir2", "rgb") for k in (1, 2)], "ir1_*.png", "ir2_*.png", 2),
         ([*both("{side}/{name}.png", ["1", "2"]), "left/9.jpg", "right/9.jpg"], "left/*.png", "right/*.png", 2),
         (both("{side}/{name}", ["1.png", "2.PNG"]), "left/*.png", "right/*.png", 2),
         ([f"{side}/{k}.png" for side in ("droite", "gauche") for k in (1, 2)], "gauche/*.png", "droite/*.png", 2),
@@ -87,6 +89,10 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         (both("{name}/{side}.png", ["1", "2"]) + both("{name}/{side}_disp.png", ["1", "2"]), *LEFT_RIGHT, 2),
         ([f"A/cam{c}/{what}/{k}.png" for c in (3, 4) for what in ("rgb", "depth") for k in (1, 2, 3)], *CAM_3_4, 3),
         ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
+        ([f"run{k}/cam_{c}.png" for k in (1, 2) for c in (3, 4)], "*/cam_3.png", "*/cam_4.png", 2),
+        ([f"camera_{c}/im0.png" for c in ("00", "02")], "camera_00/im0.png", "camera_02/im0.png", 1),
+        *([[f"camera_{c}/im{k}.png" for c in ("00", "02") for k in range(n)], *CAMERA_0_2, n] for n in (2, 3, 5)),
+        ([f"{c}/im{k}.png" for c in ("im0", "im1") for k in range(3)], "im0/im*.png", "im1/im*.png", 3),
         ([f"{s}/{k}_Camera_{n}.png" for s, n in (("left", 5), ("right", 6)) for k in (1, 2, 3)], *CAMERAS_5_6, 3),
         ([f"{what}_{c}cam/{k}.png" for what in ("depth", "image") for c in "lr" for k in (1, 2)], *LCAM, 2),
     ],
@@ -151,7 +157,7 @@ def test_two_frames_of_two_cameras_differ_by_a_number(tmp_path, name):
 
 
 def test_names_that_differ_by_two_numbers_tell_no_cameras_apart(tmp_path):
-    write_images(tmp_path, [f"run{k}/cam_{c}.png" for k in (1, 2) for c in (3, 4)])
+    write_images(tmp_path, [f"run{k}/view_{c}.png" for k in (1, 2) for c in (3, 4)])
     with raises("RIL-194"):
         inspect(tmp_path)
 

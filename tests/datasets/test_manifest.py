@@ -807,9 +807,10 @@ def test_unusual_figures_are_warnings(tmp_path, parts, line):
     assert len(warnings) <= 2
 
 
-def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path):
+@pytest.mark.parametrize("rows", [(-0.5, 0.55, 1.6), (-0.501, -0.5, 0.55, 0.551, 1.601, 1.602)])
+def test_poses_that_are_farther_apart_than_may_be_interpolated_are_refused_as_that(tmp_path, rows):
     path = write_sequence(tmp_path, '[times]\nrate_hz = 10.0\n[truth]\nfile = "p.tum"\n', frames=9)
-    write_lines(tmp_path / "p.tum", [tum(t, t) for t in (-0.5, 0.55, 1.6)])
+    write_lines(tmp_path / "p.tum", [tum(t, t) for t in rows])
     with raises("RIL-804", "1.05 s apart, more than 0.5 s"):
         opened(path)
     # At the times of the images nothing has to be.
@@ -910,10 +911,11 @@ sigma_deg = 0.5
         ("time,x,y,yaw_deg", "2,0.2,0.1,5", True),
         ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0,5", True),
         ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0,0,0.01,5", False),
-        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,5", False),
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,5", True),  # z of a barometer
+        ("time,x,y,z,roll_deg,pitch_deg,yaw_deg", "2,0.2,0.1,0.01,0,0,0", False),  # no rotations
     ],
 )
-def test_wheels_that_never_leave_a_plane_measure_neither_slopes_nor_tilts(tmp_path, names, last, plane):
+def test_odometry_that_never_rolls_or_pitches_measures_neither_slopes_nor_tilts(tmp_path, names, last, plane):
     still = ["0," + ",".join("0" for _ in names.split(",")[1:]), "1," + ",".join("0" for _ in names.split(",")[1:])]
     write_lines(tmp_path / "wheels.csv", [names, *still, last])
     mount = "[[0, 0, 1, 0.4], [-1, 0, 0, 0], [0, -1, 0, 0.9]]"  # looks ahead, 0.9 m above the axle
@@ -935,13 +937,15 @@ E = "431000,5411000,100"
         ("time,x,y,z", ["0,0,0,0", "0.5,1,0,0", "1,2,0,0"], (0, 0.5, 1)),  # where the drive begins
         ("time,x,y,z,quality", [f"0,{E},0", f"0.5,{E},4", f"1,{E},5"], (0.5, 1)),
         ("time,x,y,z,q", [f"0,{E},0", f"0.5,{E},0", f"1,{E},0"], (0, 0.5, 1)),  # says nothing
+        ("time,x,y,z", [f"{k / 4},{k // 2},0,0" for k in range(6)], (0, 0.5, 1)),  # held until the next one
+        ("time,x,y,z", [f"{k / 4},{max(k, 2)},0,0" for k in range(6)], (0, 0.25, 0.5, 0.75, 1, 1.25)),  # stood
     ],
 )
 def test_positions_without_a_fix_are_left_out_and_counted(tmp_path, names, rows, left):
     write_lines(tmp_path / "gnss.csv", [names, *rows])
     s = opened(write_sequence(tmp_path, f'{TIMED}[positions]\nfile = "gnss.csv"\nsigma = 0.5\n'))
     assert tuple(s.priors["positions"]["times"]) == left
-    assert sum("RIL-706" in line for line in s.warnings) == (len(left) < 3)
+    assert sum("RIL-706" in line for line in s.warnings) == (len(left) < len(rows))
 
 
 @pytest.mark.parametrize("place", ["", "origin = [1e3, 2e3, 0]\nazimuth_deg = 0\n"])

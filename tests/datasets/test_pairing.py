@@ -401,6 +401,24 @@ def test_a_counter_that_began_anew_goes_on_where_it_ended(first):
     ]
 
 
+@pytest.mark.parametrize(
+    ("stems", "anew"),
+    [
+        (["235958", "235959", "000000", "000001"], True),
+        (["t_23-59-58_90", "t_23-59-58_91", "t_00-00-00_10"], True),
+        (["000000", "000100", "230000"], False),  # a counter
+        (["20260503_000500", "20260503_235900"], False),
+        ([f"{k:03x}" for k in (0, 1, 9, 10, 15, 16, 26)], False),
+        (["f0a", "f1", "f1b"], False),
+    ],
+)
+def test_times_of_day_pass_midnight_and_hexadecimal_numbers_count(stems, anew):
+    lines, shuffled = [], random.Random(1).sample(stems, len(stems))
+    pairs = pair_up(paths(*(f"l/{n}.png" for n in shuffled)), paths(*(f"r/{n}.png" for n in stems)), warnings=lines)
+    assert [pair.name for pair in pairs] == stems
+    assert [line[:7] for line in lines] == (["RIL-707"] if anew else [])
+
+
 def test_a_counter_before_the_cameras_number_is_said_to_have_begun_anew():
     numbers, lines = [*range(995, 1000), *range(5)], []
     left, right = (paths(*(f"{k:03d}_cam{side}.png" for k in sorted(numbers))) for side in (0, 1))

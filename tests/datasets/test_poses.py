@@ -277,6 +277,12 @@ def test_positions_alone_are_said_to_lack_a_rotation(tmp_path, header):
         read(tmp_path, f"{header}\n{rows}\n")
 
 
+@pytest.mark.parametrize("name", ["heading", "heading_deg", "course [deg]", "imu/hdg"])
+def test_a_heading_is_told_to_be_perhaps_a_yaw_that_counts_otherwise(tmp_path, name):
+    with raises("RIL-801", "yaw_deg", f"90 less {name}", "counter-clockwise"):
+        read(tmp_path, f"time,x,y,{name}\n0,0,0,90\n1,1,0,91\n")
+
+
 def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_path):
     rows = "1,0,0,0,0.1,0.2,0.3,0.927\n2,0,0,0,0.1,0.2,0.3,0.927\n"
     plain, with_units = (read(tmp_path, f"time,x,y,z,qx,qy,qz,qw\n{units}{rows}") for units in ("", "s,m,m,m,,,,\n"))

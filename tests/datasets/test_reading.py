@@ -14,7 +14,7 @@ from rille.datasets.images import files
 from rille.datasets.images.headers import Header, read_header
 from rille.datasets.registry import open_sequence
 from rille.datasets.text import reading
-from rille.datasets.text.reading import Search, read_bytes, read_lines, read_toml
+from rille.datasets.text.reading import Search, meant, read_bytes, read_lines, read_toml
 from rille.stages.core.errors import InputError
 
 
@@ -44,8 +44,25 @@ def test_pipes_devices_and_folders_are_never_opened(tmp_path):
     for name in ("pipe", "zero", "."):
         refused("RIL-138", read_bytes, tmp_path / name, "table", 10)
     assert "name a file in it" in refused("RIL-138", read_bytes, tmp_path, "table", 10)
-    refused("RIL-138", read_bytes, tmp_path / "none", "table", 10)
+    assert "did you mean" not in refused("RIL-138", read_bytes, tmp_path / "none", "table", 10)
     refused("RIL-138", read_bytes, tmp_path / "zero\0byte", "table", 10)
+
+
+@pytest.mark.parametrize(
+    ("path", "hint"),
+    [
+        ("Calib/stereo.yml", "did you mean calib"),
+        ("calib/stero.yml", "did you mean stereo.yml"),
+        ("calib\\stereo.yml", "write / between folders"),
+        ("calib/%06d.yml", "not %06d"),
+        ("calib/*/stereo.yml", "correct"),
+    ],
+)
+def test_the_nearest_name_is_asked_for(tmp_path, path, hint):
+    (tmp_path / "calib").mkdir()
+    (tmp_path / "calib" / "stereo.yml").touch()
+    (tmp_path / "calib" / "stereo\n.yml").touch()
+    assert hint in f"{meant(tmp_path / path)}correct"
 
 
 def test_sizes_lines_and_content_are_bounded(tmp_path):

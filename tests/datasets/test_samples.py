@@ -9,7 +9,7 @@ from folders import write_sequence
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.patterns import fixed_pattern
+from rille.datasets.images.patterns import fixed_pattern, mixed
 from rille.datasets.images.samples import interlaced, mosaic
 from rille.datasets.registry import open_sequence
 
@@ -118,6 +118,24 @@ def test_a_reflection_over_all_of_the_view_is_told_from_scenes_that_move_or_rest
         for image, name in zip(views, sorted((tmp_path / side).glob("*.png")), strict=True):
             cv2.imwrite(str(name), np.clip(image - 100 + random.normal(0, noise, image.shape), 0, 255).astype(np.uint8))
     assert sum("RIL-834" in line for line in open_sequence(str(path)).warnings) == (2 if told else 0)
+
+
+@pytest.mark.parametrize("period", [0, 2, 4])
+@pytest.mark.parametrize("step", [0, 2, 20])
+def test_sums_of_neighbours_are_told_from_views_of_their_own(tmp_path, period, step):
+    random = np.random.default_rng(5)
+    scene = cv2.GaussianBlur(random.random((160, 400)), (0, 0), 1.5) * 600 - 180
+    views = [scene[:, step * k : step * k + 192] + random.normal(0, 2, (160, 192)) for k in range(9)]
+    sums = range(2, 8, period) if period else ()
+    shown = [(views[k - 1] + views[k + 1]) / 2 if k in sums else view for k, view in enumerate(views)]
+    assert mixed([cv2.resize(view, (4000, 64)) for view in shown]) == []  # a strip has no blocks
+    told = mixed(shown)
+    assert told == (list(sums) if step else [])
+    path = write_sequence(tmp_path, frames=9)
+    for side in ("left", "right"):
+        for image, name in zip(shown, sorted((tmp_path / side).glob("*.png")), strict=True):
+            cv2.imwrite(str(name), np.clip(image, 0, 255).astype(np.uint8))
+    assert any("RIL-836" in line for line in open_sequence(str(path)).warnings) == bool(told)
 
 
 def turned(folder, tags, ending="jpg"):

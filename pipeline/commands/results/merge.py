@@ -79,6 +79,8 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
         if np.array_equal(a.arrays["elevation"], b.arrays["elevation"], equal_nan=True):
             text = f"{a.name} and {b.name} are one terrain, to the bit, which would count twice"
             raise InputError("RIL-968", text, remedy="name one of them")
+    for line in lookup.shared_images(dict.fromkeys(folders)):
+        warn(line)
     sessions = [_registered(first, other) for other in others]
     lattice = union([first.lattice, *(one.covered(first.lattice.cell) for one in sessions)])
     layers = [_layer(0, first.lattice, first.arrays)]

@@ -89,7 +89,7 @@ def rig(
     found = joint(Rig.from_dict(next(iter(given.values()))), matches, params)
     atomic.write(output, _toml(found))
     print("\n".join(_table(found)))
-    for line in disagreements(found, params.significance):
+    for line in (*disagreements(found, params.significance), *lookup.shared_images(folders)):
         warn(line)
     print(f"wrote        {output}\nnext         in the manifest of each sequence:")
     print(f'\n[rig]\nfile = "{output.resolve()}"')

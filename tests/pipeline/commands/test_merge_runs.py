@@ -32,6 +32,9 @@ def centres_of(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_sessions_in_frames_of_their_own_become_one_terrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = made_run(tmp_path / "a", FIRST), made_run(tmp_path / "b", SECOND, noise=2)
+    for run, digests in ((a, "abc"), (b, "cde")):
+        rows = [{"label": f"image/left/{d}", "status": "cached", "key": d, "digest": d} for d in digests]
+        (run / "ledger.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     merge(str(a), str(b), output=tmp_path / "out")
     one = facts(tmp_path / "out")
     expected = FIRST.pose.inverse() @ SECOND.pose
@@ -48,7 +51,9 @@ def test_sessions_in_frames_of_their_own_become_one_terrain(tmp_path: Path, caps
     sigma = read_raster(tmp_path / "out" / "dem_sigma.tif", "elevation_std").grid.values
     assert 0.6 < np.sqrt(np.nanmean((error / sigma) ** 2)) < 1.3
     assert (tmp_path / "out" / "ortho.tif").exists()
-    assert "cells in common" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "cells in common" in said.out
+    assert "RIL-848: 1 left image of " in said.err
 
 
 def test_sessions_in_unlike_light_are_laid_by_their_relief(tmp_path: Path) -> None:

@@ -111,3 +111,13 @@ def test_cameras_whose_figures_are_exchanged_are_named() -> None:
     said = better_reading(wrong, wrong, {"left": right, "right": left}, matches)
     assert "figures of the two cameras seem misread" in said
     assert not better_reading(given, given, {"left": left, "right": right}, matches)
+
+
+@pytest.mark.parametrize("coefficients", [(), (-0.28, 0.07, 0.0002, 0.00002)])
+@pytest.mark.parametrize("t", [(-0.11, 0.001, 0.002), (0.001, -0.11, 0.002)])
+def test_rectified_images_with_the_calibration_of_raw_ones_are_named(coefficients: tuple, t: tuple) -> None:
+    lens = Lens(CAMERA, "radtan", coefficients) if coefficients else Lens(CAMERA)
+    parallel = Rig(CAMERA, CAMERA, RigidTransform(np.eye(3), np.where(np.abs(t) > 0.1, t, 0.0)))
+    given = Rig(CAMERA, CAMERA, RigidTransform(rotation_exp([0.01, -0.02, 0.015]), t))
+    said = better_reading(given, given, {"left": lens, "right": lens}, pairs(Lens(CAMERA), lens, parallel))
+    assert "rectified already" in said
