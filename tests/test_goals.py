@@ -1,4 +1,4 @@
-"""What whole runs must reach: the figures that the README states, with the room that noise needs (slow)."""
+"""What whole runs must reach: the figures that the README states, with half as much again for another processor (slow)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ def metrics(sequence: str, folder: Path, *settings: str, complete: bool = True) 
 def test_mockup(tmp_path: Path) -> None:
     m = metrics("mockup", tmp_path)
     assert m["frames_posed"] == 40
-    assert m["trajectory_drift"] <= 0.20  # percent of the path
+    assert m["trajectory_drift"] <= 0.06  # percent of the path
+    assert m["dem_merged_rmse"] <= 0.9e-3
+    assert m["dem_merged_completeness"] >= 0.65
     assert 0.5 <= m["trajectory_nees"] <= 2.0  # claimed covariances are those of the errors
-    assert m["dem_pairs_rmse_max"] <= 1.0e-3
+    assert m["dem_pairs_rmse_max"] <= 0.8e-3
     assert m["dem_pairs_completeness_min"] >= 0.65
     assert 0.05 <= m["path_check_hazardous_share"] <= 0.40
     # No limit is set by this bed: of 735 cells the map shows a stone of 7 mm as one of 2 mm over 4.
@@ -42,7 +44,7 @@ def test_mockup_with_a_rig_that_is_half_a_degree_off(tmp_path: Path) -> None:
     m = metrics("mockup", tmp_path, "mockup.rig_error_deg=[0.5,0.5,0.5]", "crosscheck.enabled=false")
     assert m["rig_residual_given"] > 5.0
     assert m["rig_residual"] < 0.2
-    assert m["trajectory_drift"] <= 0.25
+    assert m["trajectory_drift"] <= 0.08
 
 
 def test_mockup_that_creeps(tmp_path: Path) -> None:

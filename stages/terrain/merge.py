@@ -308,7 +308,7 @@ def _fine(dem: Bundle, lattice: Lattice, most: float | None) -> Callable[[str, W
     "merge",
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", "float32", "nan", "world"),
-        raster("elevation_std", "m", "standard deviation of the elevation, all included", "float32", "nan", "world"),
+        raster("elevation_std", "m", "standard deviation, its frame being right", "float32", "nan", "world"),
         raster("spread", "m", "standard deviation of the merged models about the elevation", "float32", "nan", "world"),
         raster("count", "1", "number of merged models", "uint16", "0", "world"),
         raster("source", "1", "pair of the greatest weight", "int32", "-1", "world"),
