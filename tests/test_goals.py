@@ -1,4 +1,4 @@
-"""What whole runs must reach: the figures that the README states, with half as much again for another processor (slow)."""
+"""What whole runs must reach: the README's figures and half as much again, for other processors (slow)."""
 
 from __future__ import annotations
 
