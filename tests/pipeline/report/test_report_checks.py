@@ -177,7 +177,6 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     for name in ("disparity", "level", "local_dem", "local_risk", "local_path", "local_dem_accuracy"):
         setattr(one, name, {0: getattr(one, name)[0]})
     one.resections = []
-    made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)
     facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
     assert facts["missing"] == []
     assert facts["verdict"].startswith("Complete: one stereo pair")
