@@ -172,12 +172,11 @@ def test_truth_outside_of_the_chosen_frames_is_no_truth(tmp_path: Path) -> None:
 def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     made = bundles()
     trajectory = made["trajectory"]
-    made["trajectory"] = Bundle({k: v[:1] for k, v in trajectory.arrays.items()}, {"frames": [0]})
+    made["trajectory"] = Bundle({k: v[:1] for k, v in trajectory.arrays.items()}, {"frames": [0], "main": 0})
     one: Any = products()
     for name in ("disparity", "level", "local_dem", "local_risk", "local_path", "local_dem_accuracy"):
         setattr(one, name, {0: getattr(one, name)[0]})
     one.resections = []
-    made["tile"] = Bundle({k: v for k, v in made["tile"].arrays.items() if k != "spread"}, made["tile"].meta)
     facts, page_, _, _ = written(tmp_path, view(made, products=one, frames=(0,)))
     assert facts["missing"] == []
     assert facts["verdict"].startswith("Complete: one stereo pair")

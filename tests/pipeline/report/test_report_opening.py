@@ -190,11 +190,12 @@ def test_standard_deviations_that_truth_contradicts_are_warned_of(positions, rot
 def given(positions, rotation, footprint):
     """A run with these positions (frame, 3), f = 350 px, 600 x 200 pixels, a baseline of .5 m."""
     poses = np.concatenate([np.broadcast_to(rotation, (len(positions), 3, 3)), positions[:, :, None]], axis=2)
+    trajectory = Bundle({"poses": poses, "piece": np.zeros(len(poses), np.int16)}, {"main": 0})
     level = SimpleNamespace(meta={"footprint": footprint, "plane": footprint and [0.0, 0.75, -2.0]})
     camera = SimpleNamespace(fx=350.0, fy=350.0, width=600, height=200)
     levels = {0: level, 4: None}
     return SimpleNamespace(
-        products=SimpleNamespace(trajectory=Bundle({"poses": poses}, {}), level=levels, ground=levels),
+        products=SimpleNamespace(trajectory=trajectory, level=levels, ground=levels),
         sequence=SimpleNamespace(rig=SimpleNamespace(left=camera, baseline=0.5)),
         bundle=lambda handle: handle,
     )
