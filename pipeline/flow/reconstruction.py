@@ -367,6 +367,8 @@ def moving_parts(
                 rig=key.rig,
                 motion=make.motion(*step),
                 segment=segment.resection,
+                a=make.pyramid(step[0], "left"),
+                b=make.pyramid(step[1], "left"),
                 back=back,
             )
     return out
