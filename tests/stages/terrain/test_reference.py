@@ -60,7 +60,10 @@ def test_the_reason_holds_the_figures() -> None:
 
 def test_ground_that_may_not_be_seen_is_named_beside_another_plane() -> None:
     unseen, seen = ({**OTHER, "matched_below": share} for share in (0.06, 0.9))
-    assert "; of 1 of the pairs less than half of the lowest quarter of the left image is matched (at least 6%)" in judge([unseen, seen], coarse=False).why
+    assert (
+        "; of 1 of the pairs less than half of the lowest quarter of the left image is matched (at least 6%)"
+        in judge([unseen, seen], coarse=False).why
+    )
     assert "lowest quarter" not in judge([seen, seen], coarse=False).why
 
 
