@@ -367,8 +367,7 @@ def moving_parts(
                 rig=key.rig,
                 motion=make.motion(*step),
                 segment=segment.resection,
-                a=make.pyramid(step[0], "left"),
-                b=make.pyramid(step[1], "left"),
+                pyramids=[make.pyramid(frame, "left") for frame in step],
                 back=back,
             )
     return out

@@ -9,6 +9,8 @@ repeat, and on walls that show little.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -136,21 +138,23 @@ def moving_stage(
     rig: Bundle[CalibrationFacts],
     motion: Bundle[MotionFacts],
     segment: Bundle,
-    a: Bundle[PyramidFacts],
-    b: Bundle[PyramidFacts],
+    pyramids: Sequence[Bundle[PyramidFacts]],
     *,
     back: bool = False,
 ) -> Bundle[MovingFacts]:
-    """Pixels of a basic pair's left image that moved by themselves to the next image; ``back``: from the one before."""
+    """Pixels of a basic pair's left image that moved by themselves to the next image; ``back``: from the one before.
+
+    ``pyramids``: of both left images, the earlier first.
+    """
     shape = np.shape(disparity["validity"])
     poses = np.asarray(segment["poses"])[-2:] if back else np.asarray(segment["poses"])[:2]
     out = np.zeros(shape, np.uint8)
     if len(poses) == 2 and np.isfinite(poses).all():
         before, after = (RigidTransform.from_matrix(pose) for pose in poses)
         level = int(motion.meta["level"])
-        images = Pyramid.from_bundle(a).images[level], Pyramid.from_bundle(b).images[level]
+        a, b = (Pyramid.from_bundle(one).images[level] for one in pyramids)
         T_b_a = after.inverse() @ before
-        off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), T_b_a, images, back=back)
+        off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), T_b_a, (a, b), back=back)
         parts = moving(off).astype(np.uint8)
         scale = 2**level
         out = parts.repeat(scale, axis=0).repeat(scale, axis=1)[: shape[0], : shape[1]]

@@ -110,7 +110,7 @@ def found(
 
     Unless ``seen_to_move``, the displacements alone say that the board moves.
     """
-    a, b = (pyramid(image) for image in views(board_moves if seen_to_move else 0.0, back=back))
+    pyramids = [pyramid(image) for image in views(board_moves if seen_to_move else 0.0, back=back)]
     disparity, motion, segment = given(board_moves, back=back, noise=noise)
     arrays = {name: np.asarray(array)[: ROWS - cut, : COLS - cut] for name, array in disparity.arrays.items()}
     disparity = Bundle(arrays, {})
@@ -122,8 +122,7 @@ def found(
             "rig": Bundle({}, {"rig": RIG.to_dict()}),
             "motion": motion,
             "segment": segment,
-            "a": a,
-            "b": b,
+            "pyramids": pyramids,
         },
     )
     check_outputs(moving_stage, out)
@@ -179,7 +178,7 @@ def test_where_nothing_is_known_nothing_moves() -> None:
     assert not moving(departures(dark, motion, RIG, T_B_A, UNLIKE, back=False)).any()
     lost = Bundle({"poses": np.full((2, 3, 4), np.nan)}, {})
     inputs = {"disparity": disparity, "rig": Bundle({}, {"rig": RIG.to_dict()}), "motion": motion, "segment": lost}
-    inputs |= dict(zip("ab", map(pyramid, UNLIKE), strict=True))
+    inputs["pyramids"] = [pyramid(image) for image in UNLIKE]
     assert not np.asarray(moving_stage.run(MovingParams(), {}, inputs)["moving"]).any()
     assert segment["poses"].shape == (2, 3, 4)
 
