@@ -383,6 +383,7 @@ def moving_parts(
                 rig=key.rig,
                 motion=make.motion(*step),
                 segment=segment.resection,
+                pyramids=[make.pyramid(frame, "left") for frame in step],
                 back=back,
             )
     return out

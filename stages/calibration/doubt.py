@@ -7,16 +7,19 @@ where each match may be off by a period.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.geometry.projection import product
 from rille.stages.hfvm.image import thinned
+from rille.stages.odometry.displacements import common_similarity
 
 MIN_MATCHES = 100
 """Fewest matches that are judged."""
@@ -85,6 +88,7 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     left, right : (row, col) grey images.
     """
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
+    b, places, f = _as_left(b, places, f)
     keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
     chosen = np.flatnonzero(keep)
     chosen = chosen[:: -(-len(chosen) // 150) or 1]
@@ -116,6 +120,29 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         # 0.05: largest difference of its correlation from that of the match.
         looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
+
+
+def _as_left(
+    right: Floats32, places: Places, f: NDArray[np.float64] | None
+) -> tuple[Floats32, Places, NDArray[np.float64] | None]:
+    """Right image, matches and lines, less the turn and the scale against the left image that all matches share.
+
+    A patch is hardly more like its match than like other places if that is turned or of another size.
+    """
+    common = common_similarity(*places)
+    scale, turn = float(np.hypot(*common[:, 0])), math.atan2(common[1, 0], common[0, 0])
+    # 1.15 and 7 degrees: below, resampling costs more than it repairs.
+    if abs(math.log(scale)) < math.log(1.15) and abs(turn) < math.radians(7.0):
+        return right, places, f
+    back, (rows, cols) = np.linalg.inv(common), right.shape
+    corners = np.array([[0, 0], [cols - 1, 0], [0, rows - 1], [cols - 1, rows - 1]]) @ back.T
+    shift, size = -corners.min(axis=0), np.ceil(np.ptp(corners, axis=0)).astype(int) + 1
+    if scale > 1.0:
+        # Its pixels become larger.
+        right = np.asarray(cv2.GaussianBlur(right, (0, 0), 0.5 * math.sqrt(scale**2 - 1.0)), np.float32)
+    right = np.asarray(cv2.warpAffine(right, np.column_stack([back, shift]), size.tolist()), np.float32)
+    whole = np.block([[back, shift[:, None]], [0.0, 0.0, 1.0]])
+    return right, (places[0], places[1] @ back.T + shift), None if f is None else np.linalg.inv(whole).T @ f
 
 
 def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:

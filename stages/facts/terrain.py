@@ -33,6 +33,8 @@ class GroundFacts(Facts):
     max_sigma: NotRequired[float]
     """Largest standard deviation, m, of elevations above a plane that is no ground."""
     no_ground: NotRequired[str]
+    matched_below: NotRequired[float]
+    """Share of matched pixels in the lowest quarter of the left image, where no ground is seen."""
     other_up: NotRequired[list[float]]
     """Normal, in the left camera's frame, of a plane that most pixels lie on and that is no ground by its attitude."""
     why: NotRequired[str]

@@ -47,7 +47,7 @@ from rille.stages.terrain.ground import (
 )
 from rille.stages.terrain.matches import Matches
 from rille.stages.terrain.points import MIN_DEPTH_SIGMAS
-from rille.stages.terrain.reference import MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE
+from rille.stages.terrain.reference import MIN_MATCHED_BELOW, MIN_REACH_HEIGHTS, MIN_REFERENCE_SHARE
 
 SCENE = "scene"
 """Instead of a stated reference plane: the scene's own."""
@@ -144,7 +144,7 @@ def level(
     except DegenerateError as error:
         why = error
     facts = _facts(RigidTransform(R_local_left, np.zeros(3)), source, _cell_without_ground(samples, rig))
-    facts["no_ground"] = str(why)
+    facts["no_ground"], facts["matched_below"] = str(why), below
     if other is not None:
         facts["other_up"] = other.up.tolist()
     if known_up is not None:
@@ -192,15 +192,15 @@ def _explained(
     except DegenerateError:
         seen = None
     if seen is None or seen.inliers < MIN_DOMINANT_SHARE:
-        message = error.message
+        seen, message = None, error.message
         remedy = "where the ground is a known surface, state its depth by ground_frame.reference_height"
-        if below < 0.5:
-            message += f"; {below:.0%} of the lowest quarter of the left image is matched"
-            remedy = f"look there at both images (dirt or drops on a lens, a torn part, glare, no texture); {remedy}"
-        return DegenerateError(error.code, message, remedy=remedy), None
-    up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
-    message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
-    remedy = "if that is the ground, state it as world.up in a manifest"
+    else:
+        up = ", ".join(f"{v + 0.0:.2f}" for v in seen.up)
+        message = f"{error.message}; the plane that it shows has its normal at [{up}] in the camera's frame"
+        remedy = "if that is the ground, state it as world.up in a manifest"
+    if below < MIN_MATCHED_BELOW:
+        message += f"; {below:.0%} of the lowest quarter of the left image is matched"
+        remedy = f"look there at both images (dirt or drops on a lens, a torn part, glare, no texture); {remedy}"
     return DegenerateError(error.code, message, remedy=remedy), seen
 
 

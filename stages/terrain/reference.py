@@ -30,6 +30,8 @@ from rille.stages.geometry.pose_arrays import GROUND_PLANE, NO_VERTICAL
 MIN_REFERENCE_SHARE = 0.4
 MIN_REACH_HEIGHTS = 5.0
 MAX_TURN_DEG = 10.0
+MIN_MATCHED_BELOW = 0.5
+"""Share of matched pixels in the lowest quarter of the left image, below which ground may be there and not be seen."""
 
 
 def seen_up(facts: GroundFacts) -> Floats | None:
@@ -76,6 +78,12 @@ def judge(levels: Sequence[GroundFacts], *, coarse: bool) -> GroundVerdict:
         if np.min(np.array(others) @ others[0]) < math.cos(math.radians(MAX_TURN_DEG)):
             stated = "the camera rolls from pair to pair: state an [attitude] or [imu], for world.up is one for all,"
         why += f", {len(others)} another plane (if it is the ground, {stated} in a manifest)"
+    blind = [facts["matched_below"] for facts in levels if facts.get("matched_below", 1.0) < MIN_MATCHED_BELOW]
+    if blind:
+        why += (
+            f"; of {len(blind)} of the pairs less than half of the lowest quarter of the left image is matched (at "
+            f"least {min(blind):.0%}): ground that lies there shows no texture, or is hidden"
+        )
     if planes and not shown:
         best = max(planes, key=lambda plane: plane.share)
         why += (

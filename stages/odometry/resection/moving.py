@@ -2,22 +2,29 @@
 
 A point with a known distance has a place in the next left image that follows from the camera's motion alone. Where the
 measured displacement (stage ``motion``) leads elsewhere, by more than both are uncertain by, over a connected part of
-the image, something moved: a vehicle, a person, their shadow. The world's model is made without such pixels.
+the image, something moved: a vehicle, a person, their shadow. The world's model is made without such pixels. If the
+next image looks the same at the place of the still scene, the displacement is wrong, as on tiles and wallpaper, which
+repeat, and on walls that show little.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bools, Floats
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import Array, Bundle, Params, stage
 from rille.stages.core.validity import matched
 from rille.stages.facts.calibration import CalibrationFacts
+from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts, MovingFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import right_pixels
+from rille.stages.imaging.pyramid import Pyramid
+from rille.stages.numeric.windows import window_mean
 from rille.stages.odometry.resection.landmarks import triangulated
 
 
@@ -32,18 +39,31 @@ class MovingParams(Params):
     enabled: bool = True
 
 
+ALIKE = 0.8
+"""Correlation of 5 x 5 coarse pixels above which both images show the same at the place of the still scene; chosen on a
+rendered room and a corridor with wallpaper, tiles and plain walls."""
+
+
 def departures(
-    disparity: Bundle, motion: Bundle[MotionFacts], rig: Rig, T_b_a: RigidTransform, *, back: bool
+    disparity: Bundle,
+    motion: Bundle[MotionFacts],
+    rig: Rig,
+    T_b_a: RigidTransform,
+    images: tuple[Floats32, Floats32],
+    *,
+    back: bool,
 ) -> Floats:
     """Departure (row, col) of each pixel of the coarse grid from the motion of the still scene, in its pixels.
 
-    Less the uncertainty of the scene's own place; NaN where the disparity or the displacement is not known.
+    Less the uncertainty of the scene's own place; NaN where the disparity or the displacement is not known, where
+    the still scene leaves the view, and where both images look alike at its place.
 
     Parameters
     ----------
     disparity : of the pair.
     motion : displacements from left image a to b, on the grid of a coarse level.
     T_b_a : motion of the camera.
+    images : left images a and b (row, col) on that grid.
     back : the pair is that of image b and not of a.
     """
     scale = 2 ** int(motion.meta["level"])
@@ -61,7 +81,21 @@ def departures(
     # From a pair of image b the still scene leads to its place in a, whose displacement must lead back.
     measured = _at(shift, (there + 0.5) / scale - 0.5) if back else shift.reshape(-1, 2)
     off = np.linalg.norm(there + measured - here if back else here + measured - there, axis=1)
-    return np.asarray((off - 3.0 * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale)
+    off = (off - 3.0 * np.linalg.norm(farther - there, axis=1)).reshape(shape) / scale
+    own, other = images[::-1] if back else images
+    seen = _at(other, (there + 0.5) / scale - 0.5, cv2.INTER_LINEAR).reshape(shape)
+    # A match of what has left the view is one of chance.
+    return np.where(_correlation(own, seen) <= ALIKE, off, np.nan)
+
+
+def _correlation(a: Floats32, b: Floats) -> Floats:
+    """Correlation (row, col) of both images in windows of 5 x 5; NaN where an image is not known or is uniform."""
+    both = np.where(np.isnan(b), np.nan, 1.0)
+    # Less a level near the middle, for smaller rounding errors.
+    x, y = ((image - 128.0) * both for image in (a, b))
+    mean_a, mean_b, ab, aa, bb = (window_mean(m.astype(np.float32), 5) for m in (x, y, x * y, x * x, y * y))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((ab - mean_a * mean_b) / np.sqrt((aa - mean_a**2) * (bb - mean_b**2)), np.float64)
 
 
 def _disparities(disparity: Bundle, pixels: NDArray[np.intp]) -> Floats:
@@ -72,11 +106,11 @@ def _disparities(disparity: Bundle, pixels: NDArray[np.intp]) -> Floats:
     return np.where(good[:, None], np.stack(maps, axis=-1), np.nan).astype(np.float64)
 
 
-def _at(shift: Floats, places: Floats) -> Floats:
-    """Displacements (n, 2) of the nearest pixels to the places (n, 2) of all pixels, column, row; NaN outside."""
-    x, y = np.nan_to_num(places, nan=-9.0).astype(np.float32).T.reshape(2, *shift.shape[:2])
-    found = cv2.remap(shift, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan, np.nan))
-    return np.asarray(found, np.float64).reshape(-1, 2)
+def _at(values: NDArray, places: Floats, how: int = cv2.INTER_NEAREST) -> Floats:
+    """Values (n, ...) of a raster (row, col, ...) at the places (n, 2) of all pixels, column, row; NaN outside."""
+    x, y = np.nan_to_num(places, nan=-9.0).astype(np.float32).T.reshape(2, *values.shape[:2])
+    found = cv2.remap(values, x, y, how, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan, np.nan))
+    return np.asarray(found, np.float64).reshape(-1, *values.shape[2:])
 
 
 def moving(off: Floats) -> Bools:
@@ -104,18 +138,25 @@ def moving_stage(
     rig: Bundle[CalibrationFacts],
     motion: Bundle[MotionFacts],
     segment: Bundle,
+    pyramids: Sequence[Bundle[PyramidFacts]],
     *,
     back: bool = False,
 ) -> Bundle[MovingFacts]:
-    """Pixels of a basic pair's left image that moved by themselves to the next image; ``back``: from the one before."""
+    """Pixels of a basic pair's left image that moved by themselves to the next image; ``back``: from the one before.
+
+    ``pyramids``: of both left images, the earlier first.
+    """
     shape = np.shape(disparity["validity"])
     poses = np.asarray(segment["poses"])[-2:] if back else np.asarray(segment["poses"])[:2]
     out = np.zeros(shape, np.uint8)
     if len(poses) == 2 and np.isfinite(poses).all():
-        a, b = (RigidTransform.from_matrix(pose) for pose in poses)
-        off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), b.inverse() @ a, back=back)
+        before, after = (RigidTransform.from_matrix(pose) for pose in poses)
+        level = int(motion.meta["level"])
+        a, b = (Pyramid.from_bundle(one).images[level] for one in pyramids)
+        T_b_a = after.inverse() @ before
+        off = departures(disparity, motion, Rig.from_dict(rig.meta["rig"]), T_b_a, (a, b), back=back)
         parts = moving(off).astype(np.uint8)
-        scale = 2 ** int(motion.meta["level"])
+        scale = 2**level
         out = parts.repeat(scale, axis=0).repeat(scale, axis=1)[: shape[0], : shape[1]]
     share = float(out.mean())
     return Bundle({"moving": out}, {"share": share})

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
 from rille.pipeline.runs.input_checks import judge_repetition
+from rille.stages.calibration.doubt import repeated
 from rille.stages.calibration.orientation import OrientationParams, orientation_stage
 from rille.stages.calibration.rig import RigParams, orient_rig
 from rille.stages.core.declare import Bundle
@@ -26,8 +28,25 @@ def test_matches_on_a_pattern_that_repeats_are_doubted(rows: bool) -> None:
     camera = Camera(200.0, 200.0, 119.5, 79.5, 240, 160)
     args = {"rig": Rig(camera, camera, RigidTransform(np.eye(3), [-0.2, 0.0, 0.0])).to_dict(), "pair": 0}
     ports = {"disparity": Bundle(maps, {}), "left": images[0], "right": images[1]}
-    repeated = orientation_stage.run(OrientationParams(), args, ports).meta["repeated"]
-    assert judge_repetition(repeated).level == ("WARN" if rows else "OK")
+    share = orientation_stage.run(OrientationParams(), args, ports).meta["repeated"]
+    assert judge_repetition(share).level == ("WARN" if rows else "OK")
+
+
+@pytest.mark.parametrize("rows", [True, False])
+@pytest.mark.parametrize(("scale", "turn_deg"), [(1.0, 0.0), (1.7, 20.0), (0.6, -15.0)])
+def test_a_right_image_that_is_turned_and_scaled_repeats_no_more(scale: float, turn_deg: float, rows: bool) -> None:
+    rng = np.random.default_rng(1)
+    scene = cv2.GaussianBlur(rng.normal(0, 1, (240, 320)), (0, 0), 4.0)
+    scene = 128 + 40 * scene / scene.std() * (0.02 if rows else 1) + 50 * rows * np.sin(np.arange(320) * 2 * np.pi / 24)
+    to_right = cv2.getRotationMatrix2D((160, 120), turn_deg, scale)
+    right = cv2.warpAffine(scene, to_right, (320, 240)) + rng.normal(0, 2, scene.shape)
+    y, x = (k.ravel().astype(float) for k in np.mgrid[10:230:6, 10:310:6])
+    places = np.stack([x, y], 1), np.stack([x, y, np.ones(x.size)], 1) @ to_right.T
+    # Epipolar lines: rows of the left image, where they lie in the right one.
+    whole = np.vstack([to_right, [0.0, 0.0, 1.0]])
+    f = np.linalg.inv(whole).T @ np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    share = repeated(scene.astype(np.float32), right.astype(np.float32), places, f)
+    assert share > 0.8 if rows else share < 0.1
 
 
 def test_matches_of_what_repeats_repair_no_rig() -> None:

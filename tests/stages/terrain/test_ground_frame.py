@@ -209,6 +209,16 @@ def test_ground_that_is_hidden_asks_for_a_look_at_the_images(down: int) -> None:
     assert "; 0% of the lowest quarter of the left image is matched: look there at both images" in facts["no_ground"]
 
 
+def test_a_wall_before_a_floor_that_nothing_matches_says_so() -> None:
+    """A floor without texture: the wall is not offered as ground alone."""
+    column, row, usable = disparity(RIG, pitched(0.0), box((-9.0, 1.0, -9.0), (9.0, 4.0, 9.0)))
+    usable[len(usable) // 2 :] = False
+    facts = level(column, row, usable, RIG, PARAMS)
+    assert "normal at [" in facts["no_ground"]
+    assert "; 0% of the lowest quarter of the left image is matched: look there at both images" in facts["no_ground"]
+    assert facts["matched_below"] == 0.0
+
+
 def test_ground_that_is_seen_too_coarsely_says_which_cells_show_it() -> None:
     """From 200 m with a baseline of 9 cm, as a drone; the remedy is taken at its word."""
     column, row, usable = disparity(RIG, POSE, plane(0.0, 0.0, -200.0))

@@ -58,6 +58,15 @@ def test_the_reason_holds_the_figures() -> None:
     assert [part for part in figures if part not in why] == []
 
 
+def test_ground_that_may_not_be_seen_is_named_beside_another_plane() -> None:
+    unseen, seen = ({**OTHER, "matched_below": share} for share in (0.06, 0.9))
+    assert (
+        "; of 1 of the pairs less than half of the lowest quarter of the left image is matched (at least 6%)"
+        in judge([unseen, seen], coarse=False).why
+    )
+    assert "lowest quarter" not in judge([seen, seen], coarse=False).why
+
+
 def test_a_camera_that_rolls_needs_an_attitude() -> None:
     rolled = [{**WALL, "other_up": [-math.sin(a), -math.cos(a), 0.0]} for a in np.radians([60.0, 75.0])]
     alike, differ = (judge(levels, coarse=False).why for levels in (rolled[:1] * 2, rolled))
