@@ -84,7 +84,7 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
     provenance = {
         **recipe(spec, refs),
         "params": spec.params.model_dump(mode="json"),
-        "hints": {k: str(v) for k, v in spec.hints.items()},
+        "hints": dict(spec.hints),
         "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
         "python": platform.python_version(),
         "started": started,
