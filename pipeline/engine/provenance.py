@@ -132,9 +132,8 @@ def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
     if not value or not isinstance(value, list | Mapping):
         yield where, value
         return
-    named = isinstance(value, Mapping)
-    for name, item in value.items() if named else enumerate(value):
-        yield from _leaves(f"{where}.{name}" if named else f"{where}[{name}]", item)
+    for name, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+        yield from _leaves(f"{where}.{name}" if isinstance(name, str) else f"{where}[{name}]", item)
 
 
 def _shown(where: str, *values: Any) -> str:
