@@ -78,6 +78,8 @@ def describe(run: Path, label: str, store: Store) -> Iterable[str]:
     row = rows[label]
     made = store.manifest(row["stage"], row["key"]) if "key" in row else None
     yield f"{label}: stage {row['stage']}, {row['status']} in run {lookup.name(run)}"
+    if others := [other for other in rows if rows[other]["stage"] == label != other]:
+        yield f"stage         {label} has also {some(others, 4)}"
     yield from _fate(row, run, made, store)
     yield from _inputs(row, rows)
     if made is None:

@@ -60,12 +60,17 @@ def test_a_run_alone_lists_its_tasks_by_stage_and_reason(three):
     assert all(" cached " in f"{line} " for line in list(why.summary(second))[1:])
 
 
-def test_a_stage_lists_its_tasks_with_reasons(three):
+def test_a_stage_lists_its_tasks_with_reasons(three, tmp_path):
     folder, _, _, third = three
     lines = [" ".join(line.split()) for line in told(folder, third, "scale")]
     assert lines[0] == "4 tasks of stage scale in run toy/3"
     assert lines[1:] == [f"scale/{k} computed params.offset 0.0 -> 0.5" for k in range(4)]
-    assert told(folder, third, "total")[0].startswith("total: stage total"), "a task of that name comes first"
+    (tmp_path / "runs" / "toy").mkdir(parents=True)
+    other = shutil.copytree(third, tmp_path / "runs" / "toy" / "3") / "ledger.jsonl"
+    other.write_text(other.read_text() + '{"label": "total/1", "stage": "total", "status": "cached"}\n')
+    lines = told(folder, other.parent, "total")
+    assert lines[0].startswith("total: stage total"), "a task of that name comes first"
+    assert lines[1].split() == ["stage", "total", "has", "also", "total/1"]
     with raises("RIL-068", "numbers"):
         told(folder, third, "number")
 

@@ -209,6 +209,19 @@ def test_of_what_is_long_the_part_that_differs_is_named(then, now, words):
     assert provenance.differences({**same, "args": then}, {**same, "args": now, "hints": hints}) == [words]
 
 
+def test_a_reason_names_the_file_that_changed(cache):
+    def make(graph, seed):
+        graph.node("toys.mischief", "image/2", NO, {"what": "", "sha256": str(seed)}, {"path": "/data/left/2.png"})
+
+    run(cache, make=make, seed=1)
+    graph, _ = run(cache, make=make, seed=2)
+    reason = "left/2.png: args.sha256 1 -> 2"
+    assert graph.nodes[0].reason == reason
+    stored = Store(cache).manifest("mischief", graph.nodes[0].key)["provenance"]
+    assert stored["hints"] == {"path": "/data/left/2.png"}
+    assert provenance.differences({**stored, "args": {"what": "", "sha256": "1"}}, stored) == [reason]
+
+
 def test_hints_and_labels_are_no_part_of_the_key(cache):
     a = Spec("toys.numbers", "a", NumbersParams(), {"frame": 1}, {"path": "/one"})
     b = Spec("toys.numbers", "b", NumbersParams(), {"frame": 1}, {"path": "/two"})
