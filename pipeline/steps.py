@@ -721,16 +721,17 @@ def _bundle(
     meta = _noted(data).get("meta", {})
     if not (lacking or meta or nothing is None):
         lacking = ["attribute rille"]
-        remedy = f"xarray has dropped it: data.attrs = MADE.attrs, where MADE is what {maker} returned"
+        remedy = f"where xarray has dropped it, data.attrs = MADE.attrs, with MADE what {maker} returned, restores it"
     else:
-        remedy = f"give what {maker} returns, whole{ELSEWHERE.get(needs[0], '')}"
+        remedy = f"give what {maker} returns, whole"
     lattice = None if lacking else lattice_of(meta)
     # Cut, turned or thinned out, the values would be taken for those of other places.
     places = {} if lattice is None else coordinates(lattice, "")
     same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
     lacking += [] if all(same) else ["x and y of all its cells, as they were"]
     if lacking:
-        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=remedy)
+        elsewhere = ELSEWHERE.get(needs[0], "")
+        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"{remedy}{elsewhere}")
     hidden = nothing or {}
     return Bundle({b.name: _as_declared(b, np.asarray(data[b.name]), hidden.get(b.name, 0)) for b in bands}, meta)
 

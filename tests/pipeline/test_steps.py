@@ -222,7 +222,7 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
         with raises("RIL-864", "rille.terrain returns, whole"):
             rille.hazards(changed)
     for attributes in ({}, {"rille": "of my own"}, {"rille": "[1]"}):
-        with raises("RIL-864", "attribute rille", "data.attrs = MADE.attrs, where MADE is what rille.terrain"):
+        with raises("RIL-864", "attribute rille", "data.attrs = MADE.attrs", "rille.terrain", "vehicle="):
             rille.hazards(dem.drop_attrs().assign_attrs(attributes))
     hazards = rille.hazards(dem, vehicle=VEHICLE)
     for bands, name in ((["risk"], "reason"), (["risk", "reason"], "elevation")):
