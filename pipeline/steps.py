@@ -43,8 +43,9 @@ from rille.pipeline.engine.runtime.environment import prepare_environment
 from rille.pipeline.engine.spec import map_ports
 from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 from rille.pipeline.flow import config
-from rille.stages.core.declare import AnyArray, Bundle, Stage
+from rille.stages.core.declare import AnyArray, Array, Bundle, Stage
 from rille.stages.core.errors import ConfigError, InputError, warning
+from rille.stages.core.validity import Validity
 from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:
@@ -374,7 +375,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     Parameters
     ----------
     disparity
-        Of :func:`match`, of this pair.
+        Of :func:`match`, of this pair, or as :func:`terrain` takes it.
     pair
         The pair.
     every
@@ -390,7 +391,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     Raises
     ------
     InputError
-        The disparity is not one of :func:`match` for images of this size.
+        The disparity is none of images of this size.
     ConfigError
         ``every`` is no whole number from 1.
 
@@ -415,7 +416,10 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
 
     if every not in range(1, 100_000):
         raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
-    found = points_of(_disparity(disparity, pair), pair.sequence.rig, int(every))
+    given = _disparity(disparity, pair)
+    built: Any = config.build(_merged(disparity, pair.settings, {}))
+    std = np.full(given["validity"].shape, built.locus.sigma_disparity)
+    found = points_of(replace(given, arrays={"disparity_std": std, **given.arrays}), pair.sequence.rig, int(every))
     return xarray.Dataset(
         {
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
@@ -428,13 +432,13 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
 
 
 def _disparity(disparity: xarray.Dataset, pair: object) -> Bundle:
-    """The result of the matcher, if it has the size of the pair's images."""
+    """The result of the matcher, if it has the size of the pair's images; what is unknown in it is not matched."""
     from rille.stages.hfvm.stage import hfvm_stage
 
     if not isinstance(pair, StereoPair):
         text = f"pair is a {type(pair).__name__}"
         raise InputError("RIL-674", text, remedy="give one pair of a sequence: rille.open(...)[0]")
-    given = _bundle(disparity, hfvm_stage, "column_disparity", "rille.match")
+    given = _bundle(disparity, hfvm_stage, ("column_disparity", "row_disparity"), "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
         text = f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}"
@@ -444,7 +448,12 @@ def _disparity(disparity: xarray.Dataset, pair: object) -> Bundle:
             text = f"the disparity was not found in the {camera} image of pair {pair.frame} of {pair.sequence.name}"
             line = f"{text}: unless that shows the same, give the pair whose images rille.match was given"
             warnings.warn(warning("RIL-796", line), stacklevel=3)
-    return given
+    arrays = dict(given.arrays)
+    known = np.isfinite(arrays["column_disparity"]) & np.isfinite(arrays["row_disparity"])
+    validity = arrays.get("validity", np.isfinite(arrays.get("disparity_std", 0)) * np.uint8(Validity.MATCHED))
+    arrays["validity"] = np.where(known, validity, validity & ~np.uint8(Validity.MATCHED | Validity.INTERPOLATED))
+    # Without errors of matching back all that is matched counts as confirmed.
+    return replace(given, arrays={"backmatch_error": np.zeros(size, np.float32), **arrays})
 
 
 def terrain(
@@ -459,7 +468,10 @@ def terrain(
     Parameters
     ----------
     disparity
-        Of :func:`match`, of this pair.
+        Of :func:`match`, of this pair; pixels that :meth:`xarray.Dataset.where` masks count as unmatched. Enough are
+        ``column_disparity`` and ``row_disparity`` (row, col), right minus left, px, NaN unknown: without ``validity``
+        all known pixels count as matched, without ``disparity_std`` their standard deviation is
+        ``locus.sigma_disparity``.
     pair
         The pair.
     reference
@@ -481,7 +493,7 @@ def terrain(
     DegenerateError
         Nothing is matched, or the pair shows no ground and ``reference`` is ``"ground"``.
     InputError
-        The disparity is not one of :func:`match` for images of this size.
+        The disparity is none of images of this size.
     ConfigError
         A parameter is unknown, or not permitted.
 
@@ -524,7 +536,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     Parameters
     ----------
     dem
-        Of :func:`terrain`, whole.
+        Of :func:`terrain`, whole; cells may be masked by :meth:`xarray.Dataset.where`.
     vehicle
         Limits and sizes (metres, degrees), as in section ``vehicle``, or a TOML file of them; None: that of the
         sequence.
@@ -572,7 +584,7 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     settings = _merged(dem, {"vehicle": limits, "risk": risk})
     built: Any = config.build(settings)
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
-    given = _bundle(dem, locus_stage.locus_stage, "elevation", "rille.terrain")
+    given = _bundle(dem, locus_stage.locus_stage, ("elevation",), "rille.terrain", {})
     if "reference" in given.meta:
         text = "the elevations are distances from a plane that is no ground, so nothing can drive there"
         raise InputError("RIL-386", text, remedy="if it is ground, state its normal as world.up in the manifest")
@@ -591,7 +603,7 @@ def path(
     Parameters
     ----------
     hazards
-        Of :func:`hazards`, whole.
+        Of :func:`hazards`, whole; what :meth:`xarray.Dataset.where` masks is unknown.
     goal, start
         (x, y), metres, in the frame of the elevation model; None: as far ahead as the ground is known and safe, from
         the rows nearest to the camera.
@@ -631,7 +643,8 @@ def path(
     ends = {name: end for name, end in (("target", goal), ("start", start)) if end is not None}
     settings = _merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
-    given = _bundle(hazards, risk_stage.risk_stage, "risk", "rille.hazards")
+    needs = "risk", "reason", "elevation"
+    given = _bundle(hazards, risk_stage.risk_stage, needs, "rille.hazards", risk_stage.NOTHING)
     asked = built.path.start is not None or built.path.target is not None
     planned = path_stage.path_stage.run(built.path, {} if asked else {"use": "local"}, {"risk": given})
     return _dataset(path_stage.path_stage, planned, settings)
@@ -672,7 +685,11 @@ def _carried(meta: Settings, settings: Settings, images: Series[int | None] = ()
 
 def _noted(data: Any) -> dict[str, Any]:
     """What the step before has :func:`_carried`."""
-    return dict(json.loads(getattr(data, "attrs", {}).get("rille", "{}")))
+    try:
+        noted = json.loads(getattr(data, "attrs", {}).get("rille", "{}"))
+    except (TypeError, ValueError):  # of the user's own
+        noted = {}
+    return noted if isinstance(noted, dict) else {}
 
 
 def _settings(data: Any) -> dict[str, Any]:
@@ -688,30 +705,49 @@ def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
     return settings
 
 
-def _bundle(data: xarray.Dataset, stage: Stage, variable: str, maker: str) -> Bundle:
-    """What a step before has made by ``stage``; ``variable`` tells its datasets from those of the other steps."""
-    lacking = [] if "rille" in getattr(data, "attrs", ()) else ["attribute rille"]
-    lacking += [] if variable in getattr(data, "data_vars", ()) else [variable]
-    if not lacking:
-        meta = json.loads(data.attrs["rille"])["meta"]
-        lattice = lattice_of(meta)
-        lacking += [] if list(data[variable].dims) == DIMS else [f"{variable} (row, col)"]
-        # Cut, turned or thinned out, the values would be taken for those of other places.
-        places = {} if lattice is None else coordinates(lattice, "")
-        same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
-        lacking += [] if all(same) else ["x and y of all its cells, as they were"]
+def _bundle(
+    data: xarray.Dataset, stage: Stage, needs: Series[str], maker: str, nothing: Mapping[str, int] | None = None
+) -> Bundle:
+    """What a step before has made by ``stage``.
+
+    ``needs``: variables without which the next step cannot be; the first tells the datasets of ``stage`` from those of
+    others. ``nothing``: values of whole numbers where a mask hides them, 0 where none is named; None: the next step
+    needs none of the facts that :func:`_carried` attaches.
+    """
+    given = getattr(data, "data_vars", ())
+    bands = [array for array in stage.outputs if array.name in given]
+    lacking = [name for name in needs if name not in given]
+    lacking += [f"{b.name} ({', '.join(b.dims)})" for b in bands if data[b.name].dims != b.dims]
+    meta = _noted(data).get("meta", {})
+    if not (lacking or meta or nothing is None):
+        lacking = ["attribute rille"]
+        remedy = f"where xarray has dropped it, data.attrs = MADE.attrs, with MADE what {maker} returned, restores it"
+    else:
+        remedy = f"give what {maker} returns, whole"
+    lattice = None if lacking else lattice_of(meta)
+    # Cut, turned or thinned out, the values would be taken for those of other places.
+    places = {} if lattice is None else coordinates(lattice, "")
+    same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
+    lacking += [] if all(same) else ["x and y of all its cells, as they were"]
     if lacking:
-        remedy = f"give what {maker} returns, whole{ELSEWHERE.get(variable, '')}"
-        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=remedy)
-    arrays = {str(name): np.asarray(array) for name, array in data.data_vars.items()}
-    # A mask over the whole dataset makes floats of bits, with NaN for what is masked.
-    for array in stage.outputs:
-        given = arrays.get(array.name)
-        if given is not None and np.dtype(array.dtype).kind != "f" and given.dtype.kind == "f":
-            text = f"{array.name} is {given.dtype}, it was {array.dtype}"
-            remedy = f"mask it by a whole number, e.g. data.assign({array.name}=data.{array.name}.where(mask, 0))"
-            raise InputError("RIL-971", text, remedy=remedy)
-    return Bundle(arrays, meta)
+        elsewhere = ELSEWHERE.get(needs[0], "")
+        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"{remedy}{elsewhere}")
+    hidden = nothing or {}
+    return Bundle({b.name: _as_declared(b, np.asarray(data[b.name]), hidden.get(b.name, 0)) for b in bands}, meta)
+
+
+def _as_declared(about: Array, values: AnyArray, nothing: int) -> AnyArray:
+    """Values of the declared type, ``nothing`` where a mask over the whole dataset hides whole numbers by NaN."""
+    dtype = np.dtype(about.dtype)
+    if values.dtype.kind in "biuf":
+        shown = np.where(np.isnan(values), nothing, values) if dtype.kind != "f" else values
+        with np.errstate(invalid="ignore"):
+            made = shown.astype(dtype)
+        if dtype.kind == "f" or np.array_equal(made, shown):
+            return made
+    text = f"{about.name} is {values.dtype} with other values than {dtype} has"
+    remedy = f"mask it by a whole number, e.g. data.assign({about.name}=data.{about.name}.where(mask, 0))"
+    raise InputError("RIL-971", text, remedy=remedy)
 
 
 def _dataset(stage: Stage, result: Bundle, settings: Settings, images: Series[int | None] = ()) -> xarray.Dataset:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +29,9 @@ Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""
 
 _KEYS = TypeAdapter(Keys)
+
+WIDTH = 40
+"""Most characters of a value."""
 
 
 class History:
@@ -64,7 +67,7 @@ class History:
         earlier = [m["provenance"] for k in keys if (m := self._store.manifest(handle.stage, k)) is not None]
         if not earlier:
             return "never computed" if not keys else "earlier artifacts are gone"
-        now = {**recipe, "params": recipe["params"].model_dump(mode="json")}
+        now = {**recipe, "params": recipe["params"].model_dump(mode="json"), "hints": handle.spec.hints}
         # Through JSON, as the stored recipe went: tuples become lists, which would differ otherwise.
         now = json.loads(json.dumps(now))
         # The nearest of the earlier ones: a user who goes back to former settings sees what is new, not what was
@@ -93,7 +96,10 @@ class History:
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """List the differences of two recipes, one phrase each: parameters first, then inputs, code and packages."""
-    found = _values("params", then.get("params"), now["params"]) + _values("args", then.get("args"), now["args"])
+    # Of a file that has changed the digests say little, its name does.
+    files = ", ".join("/".join(Path(str(at)).parts[-2:]) for _, at in _leaves("", now.get("hints", {})) if at)
+    args = (f"{files}: {text}" if files else text for text in _values("args", then.get("args"), now["args"]))
+    found = [*_values("params", then.get("params"), now["params"]), *args]
     found += _inputs(then.get("inputs", {}), now["inputs"])
     old, new = then.get("code", {}), now["code"]
     found += [f"code: {name.replace('.', '/')}.py {_change(name, old, new)}" for name in _unequal(old, new)]
@@ -108,7 +114,32 @@ def _values(where: str, old: Any, new: Any) -> list[str]:
         return [text for n in names for text in _values(f"{where}.{n}", old.get(n), new.get(n))]
     if old == new and type(old) is type(new):
         return []
-    return [f"{where} {brief(old, 40)} -> {brief(new, 40)}"]
+    lists = isinstance(old, list) and isinstance(new, list)
+    if lists and max(len(json.dumps(value)) for value in (old, new)) > WIDTH:
+        if len(old) != len(new):
+            return [f"{where} has {len(new)} values instead of {len(old)}"]
+        then, now = dict(_leaves(where, old)), dict(_leaves(where, new))
+        unlike = [name for name in {**now, **then} if then.get(name) != now.get(name)]
+        more = f" and {len(unlike) - 1} more of {len(now)} values" if len(unlike) > 1 else ""
+        return [f"{_shown(name, then.get(name), now.get(name))}{more}" for name in unlike[:1]]
+    return [_shown(where, old, new)]
+
+
+def _leaves(where: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Values within lists and dictionaries, with their places: ``args.steps[3].weight``."""
+    if not value or not isinstance(value, list | Mapping):
+        yield where, value
+        return
+    for name, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+        yield from _leaves(f"{where}.{name}" if isinstance(name, str) else f"{where}[{name}]", item)
+
+
+def _shown(where: str, *values: Any) -> str:
+    """Both values, of long ones the part where they begin to differ."""
+    texts = [value if isinstance(value, str) else json.dumps(value) for value in values]
+    alike = next((k for k, (a, b) in enumerate(zip(*texts, strict=False)) if a != b), min(map(len, texts)))
+    start = max(alike - WIDTH // 2, 0) if max(map(len, texts)) > WIDTH else 0
+    return f"{where} {' -> '.join(brief('...' * (start > 0) + text[start:], WIDTH) for text in texts)}"
 
 
 def _inputs(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ Between tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import resource
@@ -84,7 +85,7 @@ def _compute(store: Store, spec: Spec, refs: Refs, key: str) -> tuple[Ref, float
     provenance = {
         **recipe(spec, refs),
         "params": spec.params.model_dump(mode="json"),
-        "hints": {k: str(v) for k, v in spec.hints.items()},
+        "hints": json.loads(json.dumps(dict(spec.hints), default=str)),
         "host": {"name": platform.node(), "machine": platform.machine(), "cpus": os.cpu_count()},
         "python": platform.python_version(),
         "started": started,

@@ -70,6 +70,10 @@ def summarise(view: RunView, facts: Mapping[str, Any], figures: Sequence[Figure]
     outcome = delivery.complete(facts, view, figures)
     complete = not (delivery.lacking(outcome["missing"]) or view.part)
     state = "Incomplete" if not complete else "Complete but for what is listed" if outcome["missing"] else "Complete"
+    listed = {item["what"] for item in outcome["missing"]}
+    # Figures that a warning calls in question are not to be taken for sure.
+    if complete and (doubts := [line for line in facts["warnings"] if line not in listed]):
+        state += f", with {count(len(doubts), 'warning')}"
     how = "wall clock, without writing the page; what is cached costs no time"
     clock = {"group": "Run", "truth": None, **metric("Time of this run's tasks", view.seconds, "s", how)}
     return {

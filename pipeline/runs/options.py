@@ -64,6 +64,8 @@ class Settings:
 class Work(Settings):
     """:class:`Settings`, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
 
+    With ``runs``, so that a plan takes the command line of its run.
+
     Parameters
     ----------
     jobs
@@ -80,12 +82,13 @@ class Work(Settings):
     force: Annotated[frozenset[str], SEVERAL] = frozenset()
     executor: Any = "dask"
     memory_limit: str | None = None
+    runs: Runs = RUNS
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Options(Work):
-    """:class:`Work`, and options of the folder of results and of the messages during a run.
+    """:class:`Work`, and options of the part that is made and of the messages during a run.
 
     Parameters
     ----------
@@ -104,7 +107,6 @@ class Options(Work):
     keep_going: Annotated[bool, FLAG] = False
     until: Annotated[tuple[str, ...], SEVERAL] = ()
     only: Annotated[tuple[str, ...], SEVERAL] = ()
-    runs: Runs = RUNS
     progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
     quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
 

@@ -52,6 +52,9 @@ __all__ = ["CAUTION", "DOUBT_BIT", "HAZARDOUS", "REASONS", "SAFE", "UNKNOWN", "U
 
 CLASSES = {"safe": SAFE, "caution": CAUTION, "hazardous": HAZARDOUS, "unknown": UNKNOWN}
 """Values of ``risk``."""
+NOTHING = {"risk": UNKNOWN, "reason": UNKNOWN_BIT, "filled": 0}
+"""Values of the whole-numbered arrays where nothing is known."""
+
 REASONS = BITS | {"unknown": UNKNOWN_BIT, "filled": FILLED_BIT, "uncertain": DOUBT_BIT, "unseen": UNSEEN_BIT}
 """Bits of ``reason``: a measure over its limit; too little known to judge; elevation interpolated; over a limit only
 because of sigma; part of the ground in the window or below the vehicle is unknown."""
@@ -151,9 +154,8 @@ def risk_stage(
     s = mosaic(stds, np.nan, whole) if stds else np.zeros(whole.shape, dtype=np.float32)
     z, s = z.astype(np.float32), s.astype(np.float32)
     if use == "local" and too_large(vehicle, whole.shape, whole.cell):
-        nothing = {"risk": UNKNOWN, "reason": UNKNOWN_BIT, "filled": 0}
         arrays: dict[str, NDArray[Any]] = {
-            a.name: np.full(z.shape, nothing.get(a.name, np.nan), a.dtype) for a in risk_stage.outputs
+            a.name: np.full(z.shape, NOTHING.get(a.name, np.nan), a.dtype) for a in risk_stage.outputs
         }
         arrays["elevation"] = z
     else:

@@ -48,6 +48,7 @@ WRONG = {
         ("other --jobs -2", "RIL-540"),
         ("other --force no-such-stage", "RIL-035"),
         ("other --memory-limit lots", "RIL-553"),
+        ("no-such-sequence --runs elsewhere", "RIL-276"),  # taken, as by the run
     ],
     "graph": [
         ("no-such-sequence", "RIL-276"),

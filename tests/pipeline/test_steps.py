@@ -221,6 +221,20 @@ def test_what_does_not_fit_is_one_clear_line(pair: rille.StereoPair, disparity: 
     for changed in (dem.isel(row=slice(20, None)), dem.sortby("y"), dem.transpose(), dem.thin(col=2)):
         with raises("RIL-864", "rille.terrain returns, whole"):
             rille.hazards(changed)
+    for attributes in ({}, {"rille": "of my own"}, {"rille": "[1]"}):
+        with raises("RIL-864", "attribute rille", "data.attrs = MADE.attrs", "rille.terrain", "vehicle="):
+            rille.hazards(dem.drop_attrs().assign_attrs(attributes))
+    hazards = rille.hazards(dem, vehicle=VEHICLE)
+    for bands, name in ((["risk"], "reason"), (["risk", "reason"], "elevation")):
+        with raises("RIL-864", f"no {name}", "rille.hazards"):
+            rille.path(hazards[bands])
+    with raises("RIL-864", "row_disparity"):
+        rille.terrain(disparity[["column_disparity"]], pair)
+    with raises("RIL-864", "validity (row, col)"):
+        rille.terrain(disparity.assign(validity=disparity.validity.T), pair)
+    for wrong in (disparity.validity + 0.5, disparity.validity.astype(str), disparity.validity.astype(int) - 300):
+        with raises("RIL-971", "validity"):
+            rille.terrain(disparity.assign(validity=wrong), pair)
     with raises("RIL-674", "rille.open(...)[0]"):
         rille.terrain(disparity, pair.sequence)
     for image, name in ((disparity, "Dataset"), ([[1, 2], [3]], "list"), ("left.png", "left.png")):
@@ -271,8 +285,39 @@ def test_pairs_are_counted_by_whole_numbers(pair: rille.StereoPair) -> None:
 
 def test_pixels_are_masked_by_their_validity(pair: rille.StereoPair, disparity: Any, dem: Any) -> None:
     sure = disparity.disparity_std < float(disparity.disparity_std.median())
-    with raises("RIL-971", "validity"):
-        rille.terrain(disparity.where(sure), pair)
-    masked = disparity.assign(validity=disparity.validity.where(sure, 0))
-    fewer = rille.terrain(masked, pair, cell_size=0.004)
+    of_one = disparity.assign(validity=disparity.validity.where(sure, 0))
+    fewer = rille.terrain(of_one, pair, cell_size=0.004)
     assert 0 < int(fewer.elevation.notnull().sum()) < int(dem.elevation.notnull().sum())
+    of_column = disparity.assign(column_disparity=disparity.column_disparity.where(sure))
+    for masked in (disparity.where(sure), of_column):
+        found = rille.terrain(masked, pair, cell_size=0.004)
+        np.testing.assert_array_equal(found.elevation, fewer.elevation)
+        assert len(rille.points(masked, pair).point) == len(rille.points(of_one, pair).point)
+
+
+def test_masked_cells_of_a_risk_map_are_unknown(dem: Any) -> None:
+    hazards = rille.hazards(dem, vehicle=VEHICLE)
+    near = hazards.y < float(hazards.y.median())
+    of_risk = hazards.assign(risk=hazards.risk.where(near, 3), reason=hazards.reason.where(near, 128))
+    of_risk["elevation"] = of_risk.elevation.where(near)
+    found, told = (rille.path(masked) for masked in (hazards.where(near), of_risk))
+    assert found.sizes["vertex"] > 1
+    np.testing.assert_array_equal(found.path, told.path)
+    assert float(found.path[:, 1].max()) < float(hazards.y.median())
+
+
+@pytest.mark.parametrize("more", [(), ("validity",)])
+def test_two_bands_without_attributes_are_a_disparity(
+    more: tuple[str, ...], pair: rille.StereoPair, disparity: Any, dem: Any
+) -> None:
+    bands = disparity[["column_disparity", "row_disparity", *more]].drop_attrs()
+    found = rille.terrain(bands, pair, cell_size=0.004)
+    both = found.elevation.notnull() & dem.elevation.notnull()
+    assert int(both.sum()) > 0.9 * int(dem.elevation.notnull().sum())
+    assert float(abs(found.elevation - dem.elevation).where(both).median()) < 0.001
+    thin, thick = (
+        rille.points(bands.assign_attrs(rille=json.dumps({"settings": {"locus": {"sigma_disparity": sigma}}})), pair)
+        for sigma in (0.2, 0.3)
+    )
+    assert float(thick.sigma_along[0] / thin.sigma_along[0]) == pytest.approx(1.5)
+    assert len(rille.points(bands, pair).point) == len(thin.point), "0.2 px by default"

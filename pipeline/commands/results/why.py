@@ -17,7 +17,7 @@ from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Run, Runs, cache_folder
 from rille.stages.core.errors import ConfigError, did_you_mean
-from rille.stages.core.quantities import some
+from rille.stages.core.quantities import count, some
 
 SHORT_DIGITS = 12
 """Shown hexadecimal digits of a digest."""
@@ -35,8 +35,8 @@ def why(run: Run, task: str | None = None, *, runs: Runs = RUNS, cache: CacheFol
     Parameters
     ----------
     task
-        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory; without one all tasks by
-        stage and reason.
+        The task's label, as in the run's ledger.jsonl: hfvm/12, locus/world/12, trajectory; or a stage, for the reason
+        of each of its tasks; without one all tasks by stage and reason.
     """
     folder = lookup.find(run, runs)
     with lookup.reading(folder):
@@ -54,24 +54,32 @@ def summary(run: Path) -> Iterable[str]:
         reason = "" if row["status"] == "cached" else brief(row.get("reason", ""), WIDTH)
         groups.setdefault((row["stage"], row["status"], reason), []).append(row["label"])
     for (stage, status, reason), labels in groups.items():
-        yield f"{stage:24s} {len(labels):5d} {status:9s} {reason or some(labels, 3)}".rstrip()
+        yield f"{stage:24s} {len(labels):5d} {status:9s} {some(labels, 3)}{reason and f': {reason}'}"
 
 
 def describe(run: Path, label: str, store: Store) -> Iterable[str]:
-    """Lines on one task of a run.
+    """Lines on one task of a run, or on all tasks of a stage.
 
     Raises
     ------
     ConfigError
-        The run has no such task.
+        The run has no such task and no such stage.
     """
     rows = lookup.tasks(run)
     if label not in rows:
-        text = f"run {lookup.name(run)} has no task {label!r}"
-        raise ConfigError("RIL-068", text, remedy=did_you_mean(label, rows) or f"it has {some(list(rows), 4)}")
+        of_stage = [row for row in rows.values() if row["stage"] == label]
+        if not of_stage:
+            text = f"run {lookup.name(run)} has no task or stage {label!r}"
+            nearest = did_you_mean(label, [*rows, *(row["stage"] for row in rows.values())])
+            raise ConfigError("RIL-068", text, remedy=nearest or f"it has {some(list(rows), 4)}")
+        yield f"{count(len(of_stage), 'task')} of stage {label} in run {lookup.name(run)}"
+        yield from (f"{row['label']:24s} {row['status']:9s} {row.get('reason', '')}".rstrip() for row in of_stage)
+        return
     row = rows[label]
     made = store.manifest(row["stage"], row["key"]) if "key" in row else None
     yield f"{label}: stage {row['stage']}, {row['status']} in run {lookup.name(run)}"
+    if others := [other for other in rows if rows[other]["stage"] == label != other]:
+        yield f"stage         {label} has also {some(others, 4)}"
     yield from _fate(row, run, made, store)
     yield from _inputs(row, rows)
     if made is None:
@@ -130,6 +138,7 @@ def _recipe(made: Mapping[str, Any]) -> Iterable[str]:
         note = f"   (default: {brief(defaults[name], WIDTH)})" if differs else ""
         yield f"parameter     {section}.{name} = {brief(value, WIDTH)}{note}"
     yield from (f"argument      {name} = {brief(value, WIDTH)}" for name, value in past["args"].items())
+    yield from (f"source        {name} = {value}" for name, value in past.get("hints", {}).items())
     code = sorted(past["code"])
     yield f"code          {digest(past['code'])[:SHORT_DIGITS]} of {len(code)} modules: {some(code, 6)}"
     packages = ", ".join(f"{name} {version}" for name, version in sorted(past["env"].items()))

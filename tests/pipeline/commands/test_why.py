@@ -54,9 +54,25 @@ def test_a_run_alone_lists_its_tasks_by_stage_and_reason(three):
     lines = [" ".join(line.split()) for line in why.summary(third)]
     assert lines[0].endswith("tasks in run toy/3")
     assert any(line.startswith("numbers 4 cached numbers/0, numbers/1") for line in lines)
-    assert "scale 4 computed params.offset 0.0 -> 0.5" in lines
-    assert "scale 4 computed never computed" in [" ".join(line.split()) for line in why.summary(first)]
+    which = "scale 4 computed scale/0, scale/1, scale/2 and 1 more"
+    assert f"{which}: params.offset 0.0 -> 0.5" in lines
+    assert f"{which}: never computed" in [" ".join(line.split()) for line in why.summary(first)]
     assert all(" cached " in f"{line} " for line in list(why.summary(second))[1:])
+
+
+def test_a_stage_lists_its_tasks_with_reasons(three, tmp_path):
+    folder, _, _, third = three
+    lines = [" ".join(line.split()) for line in told(folder, third, "scale")]
+    assert lines[0] == "4 tasks of stage scale in run toy/3"
+    assert lines[1:] == [f"scale/{k} computed params.offset 0.0 -> 0.5" for k in range(4)]
+    (tmp_path / "runs" / "toy").mkdir(parents=True)
+    other = shutil.copytree(third, tmp_path / "runs" / "toy" / "3") / "ledger.jsonl"
+    other.write_text(other.read_text() + '{"label": "total/1", "stage": "total", "status": "cached"}\n')
+    lines = told(folder, other.parent, "total")
+    assert lines[0].startswith("total: stage total"), "a task of that name comes first"
+    assert lines[1].split() == ["stage", "total", "has", "also", "total/1"]
+    with raises("RIL-068", "numbers"):
+        told(folder, third, "number")
 
 
 def test_it_may_be_a_run_of_another_sequence(tmp_path):

@@ -17,7 +17,7 @@ from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
 from rille.pipeline.engine import events as ledger
-from rille.pipeline.engine import packages, progress
+from rille.pipeline.engine import packages, progress, provenance
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
@@ -185,6 +185,41 @@ def test_dry_run_computes_nothing_and_explains(cache):
     graph, _ = run(cache, dry=True, offset=0.5)
     assert {h.status for h in graph.nodes if h.stage == "scale"} == {"planned"}
     assert [h.reason for h in graph.nodes[-2:]] == ["params.offset 0.0 -> 0.5", "input scale/0 is to be computed"]
+
+
+LONG = [[k, 0.123456789] for k in range(9)]
+IMAGE = {"sha256": "1" * 64, "frame": 2}
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "words"),
+    [
+        ({"steps": LONG}, {"steps": [*LONG[:4], [4, 0.5], *LONG[5:]]}, "args.steps[4][1] 0.123456789 -> 0.5"),
+        ({"steps": LONG}, {"steps": [*LONG[:8], [7, 0.5]]}, "args.steps[8][0] 8 -> 7 and 1 more of 18 values"),
+        ({"steps": LONG}, {"steps": LONG[1:]}, "args.steps has 8 values instead of 9"),
+        ({"at": [{"x": LONG}]}, {"at": [{"x": LONG[:-1]}]}, "args.at[0].x[8][0] 8 -> null and 1 more of 16 values"),
+        ({"goal": [0.0, 1.0]}, {"goal": [0.0, 1.5]}, "args.goal [0.0, 1.0] -> [0.0, 1.5]"),
+        ({"why": "w" * 70 + "a"}, {"why": "w" * 70 + "b"}, f"args.why ...{'w' * 20}a -> ...{'w' * 20}b"),
+        (IMAGE, IMAGE | {"sha256": "2" * 64}, f"left/2.png: args.sha256 {'1' * 37}... -> {'2' * 37}..."),
+    ],
+)
+def test_of_what_is_long_the_part_that_differs_is_named(then, now, words):
+    same = {"params": {}, "inputs": {}, "code": {}, "env": {}, "version": 1, "format": 5}
+    hints = {"path": "/data/left/2.png"} if "sha256" in now else {}
+    assert provenance.differences({**same, "args": then}, {**same, "args": now, "hints": hints}) == [words]
+
+
+def test_a_reason_names_the_file_that_changed(cache):
+    def make(graph, seed):
+        graph.node("toys.mischief", "image/2", NO, {"what": "", "sha256": str(seed)}, {"path": "/data/left/2.png"})
+
+    run(cache, make=make, seed=1)
+    graph, _ = run(cache, make=make, seed=2)
+    reason = "left/2.png: args.sha256 1 -> 2"
+    assert graph.nodes[0].reason == reason
+    stored = Store(cache).manifest("mischief", graph.nodes[0].key)["provenance"]
+    assert stored["hints"] == {"path": "/data/left/2.png"}
+    assert provenance.differences({**stored, "args": {"what": "", "sha256": "1"}}, stored) == [reason]
 
 
 def test_hints_and_labels_are_no_part_of_the_key(cache):

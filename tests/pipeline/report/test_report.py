@@ -179,6 +179,15 @@ def test_what_is_missing_comes_first(tmp_path: Path) -> None:
     assert "trajectory" not in page_.ids
 
 
+def test_a_warning_outranks_that_nothing_is_missing(tmp_path: Path) -> None:
+    facts = {"models": [], "seam_count": 0, "seams": [], "warnings": ["the models are askew"]}
+    made = bundles() | {"overlap_audit": Bundle({}, facts)}
+    facts, page_, _, _ = written(tmp_path, view(made, products=products(made)))
+    assert facts["complete"] is True
+    assert facts["verdict"].startswith("Complete, with 1 warning: ")
+    assert page_.text.index("The models are askew") < page_.text.index("Nothing is missing")
+
+
 def test_what_is_missing_is_no_warning_besides(tmp_path: Path) -> None:
     wrong, more = "4 of 6 elevation models contradict their neighbours", "a seam of pair 3 is rough"
     facts = {"models": [], "seam_count": 0, "seams": [], "warnings": [wrong, more], "contradiction": wrong}

@@ -54,6 +54,8 @@ def test_suspicions_stand_before_the_figures(self_checked: Written) -> None:
     rig, frames = facts["warnings"]
     assert "0.60 px" in rig
     assert "frame 3" in frames
+    assert facts["verdict"].startswith("Complete but for what is listed, with 2 warnings: ")
+    assert page_.ids.index("missing-box") < page_.ids.index("warnings-box")
     assert page_.text.index("0.60 px") < page_.text.index("Accuracy Quantity")
 
 
