@@ -436,6 +436,80 @@ def test_no_path_is_what_does_not_lead_the_length_of_the_vehicle(lengths: float,
         assert "ahead" in facts["reason"]
 
 
+LONG = SHORT.model_copy(update={"wheel_base": 0.2 - SHORT.wheel_diameter})
+"""20 cells long."""
+
+
+RIM = 12
+"""Cells of known ground around a map, on which the outline of that vehicle stays."""
+
+
+def closed_to_the_middle(free: np.ndarray) -> tuple[dict[str, np.ndarray], Lattice]:
+    """Ground on which the vehicle's middle, but not a wheel, is kept off all that is not ``free``, with a rim of it."""
+    free = np.pad(free, RIM)
+    lattice = Lattice.at(-free.shape[1] // 2, 100, CELL, *free.shape)
+    return maps(np.where(free, 0, HAZARDOUS), level(lattice)[1], "tilt"), lattice
+
+
+@pytest.mark.parametrize("end", ["start", "target"])
+@pytest.mark.parametrize(("stub", "found"), [(18, True), (21, False)])
+def test_a_path_by_rows_starts_and_ends_within_a_length_of_the_ragged_ends(stub: int, end: str, found: bool) -> None:
+    """The last rows hold a few free cells that lead nowhere."""
+    free = np.ones((100, 41), bool)
+    free[:stub] = False
+    free[: stub - 1, 20] = True
+    given, lattice = closed_to_the_middle(free if end == "target" else free[::-1])
+    route = find_path(given, lattice, LONG, params=PathParams(planner="rows"))
+    assert (len(route.cells) > 0) == found
+    if found:
+        rows = (99, stub) if end == "target" else (99 - stub, 0)
+        assert (route.cells[[0, -1], 0] - RIM).tolist() == list(rows)
+    else:
+        assert route.blocking_row == RIM + (stub - 1 if end == "target" else 99 - stub + 1)
+
+
+@pytest.mark.parametrize("stretch", [False, True])
+@pytest.mark.parametrize("planner", ["auto", "rows", "grid8"])
+@pytest.mark.parametrize(("rows", "found"), [(21, True), (20, False)])
+def test_a_path_across_a_map_no_longer_than_the_vehicle_is_none(
+    rows: int, found: bool, planner: str, stretch: bool
+) -> None:
+    lattice = Lattice.at(-20, 100, CELL, rows, 41)
+    given = maps(*level(lattice))
+    route = find_path(given, lattice, LONG, stretch=stretch, params=PathParams(planner=planner))
+    assert (len(route.cells) == 21) == found
+    if not found:
+        assert not len(route.cells)
+        assert "vehicle's length ahead" in route.reason
+        assert (route.blocking_row is None) == (planner != "grid8"), "rows cross the map"
+
+
+@pytest.mark.parametrize("planner", ["auto", "rows", "grid8"])
+def test_only_to_a_target_that_is_asked_for_a_path_may_be_shorter_than_the_vehicle(planner: str) -> None:
+    lattice = Lattice.at(-20, 100, CELL, 100, 41)
+    given, params = maps(*level(lattice)), PathParams(planner=planner)
+    start, target = (tuple(lattice.xy()[row, 20]) for row in (12, 0))
+    assert len(find_path(given, lattice, LONG, ends=(start, target), params=params).cells) == 13
+    assert not len(find_path(given, lattice, LONG, ends=(start, None), stretch=True, params=params).cells)
+
+
+@pytest.mark.parametrize(("stretch", "end"), [(False, (5, 2)), (True, (20, 20))])
+def test_a_stop_goes_as_far_as_ground_leads_and_a_mission_not_into_its_last_corner(
+    stretch: bool, end: tuple[int, int]
+) -> None:
+    free = np.zeros((100, 41), bool)
+    free[20:] = free[5:20, 2] = True
+    route = find_path(*closed_to_the_middle(free), LONG, stretch=stretch, params=PathParams(planner="grid8"))
+    assert tuple(route.cells[-1] - RIM) == end
+
+
+def test_a_mission_goes_into_the_last_corner_where_it_else_led_no_length_ahead() -> None:
+    free = np.zeros((100, 41), bool)
+    free[10:30] = free[:10, 2] = free[90:] = True
+    route = find_path(*closed_to_the_middle(free), LONG, stretch=True)
+    assert (route.cells[[0, -1]] - RIM).tolist() == [[29, 20], [0, 2]]
+
+
 def test_a_local_path_goes_round_what_closes_the_rows() -> None:
     lattice = Lattice.at(-30, 120, CELL, 120, 61)
     risk, z = level(lattice)
