@@ -57,8 +57,7 @@ def export(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
     if sequence.times is not None:
         np.savetxt(folder / "times.txt", [sequence.times[k] for k in frames], EXACT)
     if sequence.vehicle is not None:
-        text = tomli_w.dumps({"vehicle": sequence.vehicle.model_dump(mode="json")})
-        (folder / VEHICLE_FILE).write_text(text, encoding="utf-8")
+        (folder / VEHICLE_FILE).write_text(tomli_w.dumps({"vehicle": sequence.vehicle.model_dump()}), "utf-8")
     basic = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in sorted({*basic} - {*sequence.lost}):
         if sequence.truth_disparity is not None:

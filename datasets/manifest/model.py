@@ -494,9 +494,8 @@ def stated_vehicle(folder: Path) -> Vehicle | None:
         The file cannot be read, or states no vehicle; the message names the key.
     """
     path = folder / VEHICLE_FILE
-    if not path.is_file():
-        return None
-    return validated("RIL-223", OfVehicle, read_toml(path, "vehicle"), file=str(path)).vehicle
+    there = path.is_file()
+    return validated("RIL-964", OfVehicle, read_toml(path, "vehicle"), file=str(path)).vehicle if there else None
 
 
 def read_manifest(path: Path) -> Manifest:

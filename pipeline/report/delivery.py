@@ -312,14 +312,13 @@ def oversized(view: RunView) -> list[str]:
     risk, length = view.bundle(view.products.world_risk), 2.0 * DEFAULT_VEHICLE.half_length
     if risk is None or view.config.vehicle != DEFAULT_VEHICLE:
         return []
-    sides = sorted(n * risk.meta["lattice"]["cell"] for n in risk["risk"].shape)
+    short, long = sorted(n * risk.meta["lattice"]["cell"] for n in risk["risk"].shape)
+    words = (
+        f"the vehicle is the {DEFAULT_VEHICLE.name}, {metres(length)} long, and the map {metres(long)} x "
+        f"{metres(short)}: no path keeps it on the map; state [vehicle] in the manifest, at the scale of the images"
+    )
     # A path leads a length ahead, and half the vehicle is behind its start and before its end.
-    if sides[1] >= 2.0 * length:
-        return []
-    return [
-        f"the vehicle is the {DEFAULT_VEHICLE.name}, {metres(length)} long, and the map {metres(sides[1])} x "
-        f"{metres(sides[0])}: no path keeps it on the map; state [vehicle] in the manifest, at the scale of the images"
-    ]
+    return [words] if long < 2.0 * length else []
 
 
 def _crosscheck_off(view: RunView) -> Items:

@@ -261,26 +261,21 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
     ``ends`` as cells."""
     far, near = span = row_span(~ground.closed)
     length, target = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell), ends[1]
-    # On a short map a vehicle's length could make start and target swap their rows.
+    # On a short map ends that are a vehicle's length from its borders would leave out most of it.
     slack, blocking = min(length, (near - far) // 4), near
     for planner in ("rows", "grid8") if params.planner == "auto" else (params.planner,):
-        by_rows = planner == "rows"
-        found = (
-            _by_rows(ground, ends, slack, params)
-            if by_rows
-            else _anywhere(ground, ends, slack, length if stretch else None)
-        )
+        rows, ahead = planner == "rows", length if stretch else None
+        found = _by_rows(ground, ends, slack, params) if rows else _anywhere(ground, ends, slack, ahead)
         for below, cells, top in found:
             # To a target that is asked for it is as far as that is.
             if len(cells) and (target is not None or cells[0, 0] - cells[-1, 0] >= length):
                 return Route(cells, ground.xyz(cells), planner, below, span)
-            blocking = top - 1 if by_rows else blocking
-    nothing = NO_CELLS, np.empty((0, 3)), planner, "middle", span
+            blocking = top - 1 if rows else blocking
+    reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
     if blocking < far:
         # Rows cross the map: the target lies aside of what they reach, or the map is shorter than the vehicle.
-        return Route(*nothing, AHEAD if target is None else JOINED)
-    reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
-    return Route(*nothing, reason, blocking)
+        reason = AHEAD if target is None else JOINED
+    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, blocking if blocking >= far else None)
 
 
 def _by_rows(ground: PathMaps, ends: Cells, slack: int, params: PathParams) -> Iterator[tuple[str, Ints, int]]:
@@ -300,12 +295,12 @@ def _by_rows(ground: PathMaps, ends: Cells, slack: int, params: PathParams) -> I
             yield below, _traced(steps, reached, target or end), top
 
 
-def _anywhere(ground: PathMaps, ends: Cells, slack: int, stretch: int | None) -> Iterator[tuple[str, Ints, int]]:
+def _anywhere(ground: PathMaps, ends: Cells, slack: int, ahead: int | None) -> Iterator[tuple[str, Ints, int]]:
     """Paths in any direction, to the target or, without one, as far as connected ground leads; as of :func:`_by_rows`,
-    but with a free end from the ground on that leads over most rows. ``stretch``: rows that a path crosses which may
-    begin anywhere, and end up to ``slack`` rows earlier; None: it may not."""
+    but with a free end from the ground on that leads over most rows. ``ahead``: least rows of a mission's path, which
+    may begin anywhere and end up to ``slack`` rows earlier; None: it is that of a stop."""
     (_, near), (start, target), grounds = row_span(~ground.closed), ends, list(GROUNDS)
-    behind = near - slack if stretch is None else 0
+    behind = near - slack if ahead is None else 0
     if None in ends:
         # With a free end a stricter ground would always find some path, on however small a part.
         grounds.sort(key=lambda below: -ground.connected(below, behind, start or target)[1])
@@ -319,7 +314,7 @@ def _anywhere(ground: PathMaps, ends: Cells, slack: int, stretch: int | None) ->
             reached = cost < UNREACHED
             top = row_span(reached)[0]
             # As far as it leads for a stop; a mission's path need not end in the very last corner.
-            last = top if stretch is None else max(top, min(top + slack, first[0] - stretch))
+            last = top if ahead is None else max(top, min(top + slack, first[0] - ahead))
             yield below, _traced(steps, reached, target or nearest_middle(reached[: last + 1], top)), top
 
 

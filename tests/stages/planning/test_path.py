@@ -252,7 +252,10 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert describe(from_start, given, lattice, SHORT)["left_out_m"][1] > 0.70, "the other side is left out"
 
 
-@pytest.mark.parametrize(("y", "closed", "begins"), [(-0.6, False, -0.3), (0.0, False, 0.0), (0.0, True, 0.0)])
+@pytest.mark.parametrize(
+    ("y", "closed", "begins"),
+    [(-0.6, False, -0.3), (0.0, False, 0.0), (0.0, True, 0.0), (-0.26, False, -0.3), (0.58, False, -0.3)],
+)
 def test_a_mission_begins_where_the_rig_began(y: float, closed: bool, begins: float) -> None:
     """The map's first row lies ahead of it after a straight drive, far behind it after an orbit."""
     lattice = Lattice.at(-30, 60, CELL, 91, 61)
@@ -397,21 +400,24 @@ WALLS = {
 }
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize("planner", ["auto", "grid8"])
 @pytest.mark.parametrize("words", [*WALLS, "p_hazard"])
 def test_a_local_path_leads_as_far_as_the_ground_is_known_and_safe_and_says_what_ends_it(
-    words: str, planner: str
+    words: str, planner: str, margin: float
 ) -> None:
     """A wall lies 60 rows ahead of the nearest one; beyond it is more ground than before it."""
     lattice = Lattice.at(-20, 160, CELL, 160, 41)
     risk, z = level(lattice)
-    given = maps(risk, z) | {"p_hazard": np.zeros(lattice.shape, np.float32)}
+    # All ground has the greatest probability that is permitted.
+    given = maps(risk, z) | {"p_hazard": np.full(lattice.shape, 0.1, np.float32)}
+    rover = SHORT.model_copy(update={"margin": margin})
     for name, value in WALLS.get(words, {"p_hazard": 0.3}).items():
         given[name][80:100] = value
-    facts = describe(find_path(given, lattice, SHORT, params=PathParams(planner=planner)), given, lattice, SHORT)
+    facts = describe(find_path(given, lattice, rover, params=PathParams(planner=planner)), given, lattice, rover)
     assert facts["found"]
     assert facts["start"][1] <= lattice.ys()[-1] + 4 * SHORT.half_length, "where the vehicle stands"
-    assert lattice.ys()[99] - 4 * SHORT.half_length < facts["target"][1] < lattice.ys()[99]
+    assert lattice.ys()[99] - 4 * SHORT.half_length - margin < facts["target"][1] < lattice.ys()[99]
     assert facts["ended_by"] == (words if words in WALLS else "ground too uncertain to be called safe")
 
 
@@ -452,7 +458,7 @@ def closed_to_the_middle(free: np.ndarray) -> tuple[dict[str, np.ndarray], Latti
 
 
 @pytest.mark.parametrize("end", ["start", "target"])
-@pytest.mark.parametrize(("stub", "found"), [(18, True), (21, False)])
+@pytest.mark.parametrize(("stub", "found"), [(20, True), (21, False)])
 def test_a_path_by_rows_starts_and_ends_within_a_length_of_the_ragged_ends(stub: int, end: str, found: bool) -> None:
     """The last rows hold a few free cells that lead nowhere."""
     free = np.ones((100, 41), bool)
@@ -501,6 +507,30 @@ def test_a_stop_goes_as_far_as_ground_leads_and_a_mission_not_into_its_last_corn
     free[20:] = free[5:20, 2] = True
     route = find_path(*closed_to_the_middle(free), LONG, stretch=stretch, params=PathParams(planner="grid8"))
     assert tuple(route.cells[-1] - RIM) == end
+
+
+def test_on_a_short_map_a_path_by_rows_goes_into_the_last_corner() -> None:
+    free = np.zeros((40, 41), bool)
+    free[10:] = free[:10, 2] = True
+    route = find_path(*closed_to_the_middle(free), LONG, params=PathParams(planner="rows"))
+    assert (route.cells[-1] - RIM).tolist() == [0, 2]
+
+
+def test_a_path_by_rows_begins_in_its_place_however_dear_that_ground_is() -> None:
+    free = np.ones((60, 41), bool)
+    given, lattice = closed_to_the_middle(free)
+    given["risk"][RIM + 45 : RIM + 60, RIM:-RIM] = CAUTION
+    route = find_path(given, lattice, LONG, params=PathParams(planner="rows", caution_cost=10.0))
+    assert (route.cells[0] - RIM).tolist() == [59, 20]
+
+
+def test_of_rows_that_all_but_the_last_can_be_entered_the_last_one_blocks() -> None:
+    free = np.ones((60, 41), bool)
+    free[0, 1:] = free[1, :10] = False
+    given, lattice = closed_to_the_middle(free)
+    ends = (None, tuple(lattice.xy()[RIM, RIM]))
+    route = find_path(given, lattice, LONG, ends=ends, params=PathParams(planner="rows"))
+    assert route.blocking_row == RIM
 
 
 def test_a_mission_goes_into_the_last_corner_where_it_else_led_no_length_ahead() -> None:
