@@ -467,6 +467,9 @@ def test_a_path_by_rows_starts_and_ends_within_a_length_of_the_ragged_ends(stub:
     given, lattice = closed_to_the_middle(free if end == "target" else free[::-1])
     route = find_path(given, lattice, LONG, params=PathParams(planner="rows"))
     assert (len(route.cells) > 0) == found
+    if end == "start":
+        anywhere = find_path(given, lattice, LONG, params=PathParams(planner="grid8"))
+        assert (len(anywhere.cells) > 0) == found
     if found:
         rows = (99, stub) if end == "target" else (99 - stub, 0)
         assert (route.cells[[0, -1], 0] - RIM).tolist() == list(rows)
@@ -530,7 +533,7 @@ def test_of_rows_that_all_but_the_last_can_be_entered_the_last_one_blocks() -> N
     given, lattice = closed_to_the_middle(free)
     ends = (None, tuple(lattice.xy()[RIM, RIM]))
     route = find_path(given, lattice, LONG, ends=ends, params=PathParams(planner="rows"))
-    assert route.blocking_row == RIM
+    assert (route.blocking_row, route.reason) == (RIM, "hazardous or unknown ground closes the whole width")
 
 
 def test_a_mission_goes_into_the_last_corner_where_it_else_led_no_length_ahead() -> None:
