@@ -85,8 +85,7 @@ class Stance(NamedTuple):
         return Stance(
             at.astype(np.int64),
             under.astype(np.int64),
-            # Wheels on one coarse cell would have a span of 0.
-            np.maximum(spans, cell).astype(np.float32),
+            spans.astype(np.float32),
             weights.astype(np.float32),
             max(1, round(0.25 * vehicle.wheel_diameter / cell)),
             max(1, round(0.5 * part / cell)),
@@ -186,7 +185,7 @@ def _steepest(wheels, spans, out):  # type: ignore[no-untyped-def]
     left, right, front, rear = one / spans[0], one / spans[1], one / spans[2], one / spans[3]
     for c in range(out.shape[0]):
         fl, fr, rl, rr = wheels[0][c], wheels[1][c], wheels[2][c], wheels[3][c]
-        # NaN compares false and is no maximum: a plane with a wheel over unknown ground is left out.
+        # NaN compares false and is no maximum: planes with a wheel over unknown ground, or two on a cell, do not count.
         along = max(zero, abs(fl - rl) * left, abs(fr - rr) * right)
         across = max(zero, abs(fl - fr) * front, abs(rl - rr) * rear)
         out[c] = max(out[c], along * along + across * across)
