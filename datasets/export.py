@@ -10,7 +10,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import tomli_w
 
+from rille.datasets.manifest.model import VEHICLE_FILE
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import InputError
@@ -54,6 +56,8 @@ def export(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
         np.savetxt(folder / "poses.txt", rows, EXACT)
     if sequence.times is not None:
         np.savetxt(folder / "times.txt", [sequence.times[k] for k in frames], EXACT)
+    if sequence.vehicle is not None:
+        (folder / VEHICLE_FILE).write_text(tomli_w.dumps({"vehicle": sequence.vehicle.model_dump()}), "utf-8")
     basic = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in sorted({*basic} - {*sequence.lost}):
         if sequence.truth_disparity is not None:

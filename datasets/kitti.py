@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rille.datasets.cameras import read_cameras
 from rille.datasets.images.files import SUFFIXES, Digests
-from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth
+from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth, stated_vehicle
 from rille.datasets.manifest.opening import open_described
 from rille.datasets.manifest.rig import CAR, STREET
 from rille.datasets.protocol import Sequence
@@ -100,6 +100,7 @@ def manifest_of(folder: Path, sides: tuple[str, str]) -> Manifest:
         cameras=Cameras(file="calib.txt", names=names),
         times=Times(file="times.txt") if (folder / "times.txt").is_file() else None,
         truth=truth,
+        vehicle=stated_vehicle(folder),
     )
 
 

@@ -20,11 +20,13 @@ from rille.datasets.images.pairing import UNWRITABLE, natural, side_of, writable
 from rille.datasets.inspection.calibration import CALIBRATIONS, FoundCalibration, find_calibration
 from rille.datasets.inspection.tables import CAMERA_WORDS, TABLES, table_kind
 from rille.datasets.inspection.views import COMPUTED, DEPTH, FoundImages, find_views, relative
+from rille.datasets.manifest.model import VEHICLE_FILE, stated_vehicle
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
+from rille.stages.hazard.vehicle import Vehicle
 
 MOST_TEXTS = 200
 """Text files that are tried as calibration and as table; some data sets have one for each image."""
@@ -46,6 +48,7 @@ class Findings:
     others: list[str] = field(default_factory=list)
     masks: dict[str, str] = field(default_factory=dict)
     tables: dict[str, list[str]] = field(default_factory=dict)
+    vehicle: Vehicle | None = None
     unread: list[str] = field(default_factory=list)
 
 
@@ -81,6 +84,10 @@ def inspect(folder: Path) -> Findings:
             raise InputError(error.code, text, remedy="; ".join(lines)) from error
         raise InputError(error.code, "; ".join([text, *lines]), remedy=error.remedy) from error
     found.unread += search.closed
+    try:
+        found.vehicle = stated_vehicle(folder)
+    except InputError as error:
+        found.unread.append(str(error))
     found.unread += [*found.views.others, *_places_in_images(found.views.left, folder, search)]
     # Each is tried as a calibration and as a table; thousands of them (one for each image) would take minutes.
     if len(texts) > MOST_TEXTS:
@@ -148,8 +155,8 @@ def _files(folder: Path, search: Search) -> list[Path]:
 
 
 def _is_data(path: Path) -> bool:
-    """Whether a path is a file, and no manifest of any name."""
+    """Whether a path is a file, and neither a manifest of any name nor what states the vehicle."""
     with suppress(InputError):
-        if path.suffix == ".toml" and "images" in read_toml(path, "manifest"):
+        if path.name == VEHICLE_FILE or (path.suffix == ".toml" and "images" in read_toml(path, "manifest")):
             return False
     return is_file(path)

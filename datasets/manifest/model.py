@@ -475,6 +475,29 @@ class Manifest(Table):
         return self
 
 
+VEHICLE_FILE = "vehicle.toml"
+"""File beside the images whose table ``[vehicle]`` is that of a manifest; `--config` takes it as well."""
+
+
+class OfVehicle(Params):
+    """Tables of :data:`VEHICLE_FILE`."""
+
+    vehicle: Vehicle
+
+
+def stated_vehicle(folder: Path) -> Vehicle | None:
+    """The vehicle of a folder's :data:`VEHICLE_FILE`; None: it has none.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or states no vehicle; the message names the key.
+    """
+    path = folder / VEHICLE_FILE
+    there = path.is_file()
+    return validated("RIL-964", OfVehicle, read_toml(path, "vehicle"), file=str(path)).vehicle if there else None
+
+
 def read_manifest(path: Path) -> Manifest:
     """Manifest of a TOML file.
 

@@ -22,10 +22,10 @@ one nearest to that row's middle; the target likewise at the last row. Over a ma
 where the rig began, as after an orbit, the start is the cell nearest to that place, on connected ground over most rows.
 
 Where no path by rows comes within one vehicle length of the last row, ``auto`` goes, in any direction, as far as
-connected ground leads from the first rows: that is a path if it leads at least one vehicle length ahead, and
-``ended_by`` says what ends it. A mission's map, on which the vehicle stands nowhere in particular, may be cut by ground
-that it cannot cross: then the connected ground over most rows (of that around the end that is given, if one is) is
-crossed, and the length left out is reported (``left_out_m``).
+connected ground leads from the first rows. Unless a target is given, a path leads at least one vehicle length ahead,
+else there is none; ``ended_by`` says what ends it. A mission's map, on which the vehicle stands nowhere in particular,
+may be cut by ground that it cannot cross: then the connected ground over most rows (of that around the end that is
+given, if one is) is crossed, and the length left out is reported (``left_out_m``).
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import Array, Bundle, Memory, stage
@@ -182,6 +183,7 @@ Cells = tuple[Cell | None, Cell | None]
 
 BY_ROWS = "hazardous or unknown ground closes the whole width"
 AHEAD = "no ground that is known and safe leads a vehicle's length ahead"
+NO_CELLS: Ints = np.empty((0, 2), np.int64)
 JOINED = "start and target are not connected by ground that the vehicle may cross"
 
 
@@ -258,57 +260,74 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
     """Path of the planner that is asked for; ``auto``: by rows, else in any direction. Others as in :func:`find_path`,
     ``ends`` as cells."""
     far, near = span = row_span(~ground.closed)
-    cell, target = ground.lattice.cell, ends[1]
-    length = math.ceil(2.0 * vehicle.half_length / cell)
-    # On a short map a vehicle's length could make start and target swap their rows.
+    length, target = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell), ends[1]
+    # On a short map ends that are a vehicle's length from its borders would leave out most of it.
     slack, blocking = min(length, (near - far) // 4), near
     for planner in ("rows", "grid8") if params.planner == "auto" else (params.planner,):
-        by_rows = planner == "rows"
-        behind = 0 if stretch and not by_rows else near - slack
-        for below, starts in _grounds(ground, ends, behind, by_rows=by_rows):
-            if by_rows:
-                # The length that every path has, a row a step, is free.
-                terrain = ground.terrain(below, params.detour_cost, 1.0)
-                cost, steps = sweep(terrain, first_costs(starts, near, cell))
-            else:
-                # A step costs its length as climb: else a path of no climb could be of any length.
-                cost, steps = search(ground.terrain(below, 1.0, 0.0), nearest_middle(starts, near), target)
-            reached = cost < UNREACHED
-            top, bottom = row_span(reached)
-            if by_rows:
-                blocking, row, limit, leads = top - 1, far, far + slack, top <= far + slack
-            else:
-                # As far as it leads for a stop; a mission's path need not end in the very last corner.
-                row, limit, leads = top, top + (slack if stretch else 0), bottom - top >= length
-            end = nearest_middle(reached[: limit + 1], row) if leads else None
-            if target is not None:
-                end = target if reached[target] else None
-            if end is not None:
-                cells = trace(steps, end)
+        rows, ahead = planner == "rows", length if stretch else None
+        found = _by_rows(ground, ends, slack, params) if rows else _anywhere(ground, ends, slack, ahead)
+        for below, cells, top in found:
+            # To a target that is asked for it is as far as that is.
+            if len(cells) and (target is not None or cells[0, 0] - cells[-1, 0] >= length):
                 return Route(cells, ground.xyz(cells), planner, below, span)
-    nothing = np.empty((0, 2), np.int64), np.empty((0, 3)), planner, "middle", span
-    if target is not None and blocking < far:
-        # Rows cross the map: the target lies aside of what they reach.
-        return Route(*nothing, JOINED)
+            blocking = top - 1 if rows else blocking
     reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
-    return Route(*nothing, reason, blocking)
+    if blocking < far:
+        # Rows cross the map: the target lies aside of what they reach, or the map is shorter than the vehicle.
+        reason = AHEAD if target is None else JOINED
+    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, blocking if blocking >= far else None)
 
 
-def _grounds(ground: PathMaps, ends: Cells, behind: int, *, by_rows: bool) -> Iterator[tuple[str, Bools]]:
-    """Parts of the vehicle that stay on known ground, with the cells (row, col) where a path may start on each: the
-    one that is given, or from row ``behind`` on all cells by rows, else the connected ground over most rows."""
-    (given, target), order = ends, list(GROUNDS)
-    at = given or target
-    if not by_rows and None in ends:
-        # With a free end a stricter ground would always find some path, on however small a part.
-        order.sort(key=lambda below: -ground.connected(below, behind, at)[1])
-    for below in order:
-        cells = ground.ways(below) > 0 if by_rows or given else ground.connected(below, behind, at)[0]
-        starts = np.zeros_like(cells)
-        where = np.s_[behind:] if given is None else given
-        starts[where] = cells[where]
+def _by_rows(ground: PathMaps, ends: Cells, slack: int, params: PathParams) -> Iterator[tuple[str, Ints, int]]:
+    """Paths a row a step, to the target or, without one, to within ``slack`` rows of the last row: for each part of the
+    vehicle that stays on known ground, from the strictest on, its name, cells (vertex, 2), empty where there is none,
+    and the farthest row reached."""
+    (far, near), (start, target) = row_span(~ground.closed), ends
+    for below in GROUNDS:
+        starts = _starts(ground.ways(below) > 0, start, near - slack)
         if starts.any():
-            yield below, starts
+            # The length that every path has, a row a step, is free.
+            terrain = ground.terrain(below, params.detour_cost, 1.0)
+            cost, steps = sweep(terrain, first_costs(starts, near, ground.lattice.cell))
+            reached = cost < UNREACHED
+            top = row_span(reached)[0]
+            end = nearest_middle(reached[: far + slack + 1], far) if top <= far + slack else None
+            yield below, _traced(steps, reached, target or end), top
+
+
+def _anywhere(ground: PathMaps, ends: Cells, slack: int, ahead: int | None) -> Iterator[tuple[str, Ints, int]]:
+    """Paths in any direction, to the target or, without one, as far as connected ground leads; as of :func:`_by_rows`,
+    but with a free end from the ground on that leads over most rows. ``ahead``: least rows of a mission's path, which
+    may begin anywhere and end up to ``slack`` rows earlier; None: it is that of a stop."""
+    (_, near), (start, target), grounds = row_span(~ground.closed), ends, list(GROUNDS)
+    behind = near - slack if ahead is None else 0
+    if None in ends:
+        # With a free end a stricter ground would always find some path, on however small a part.
+        grounds.sort(key=lambda below: -ground.connected(below, behind, start or target)[1])
+    for below in grounds:
+        cells = ground.ways(below) > 0 if start else ground.connected(below, behind, target)[0]
+        starts = _starts(cells, start, behind)
+        if starts.any():
+            # A step costs its length as climb: else a path of no climb could be of any length.
+            first = nearest_middle(starts, near)
+            cost, steps = search(ground.terrain(below, 1.0, 0.0), first, target)
+            reached = cost < UNREACHED
+            top = row_span(reached)[0]
+            # As far as it leads for a stop; a mission's path need not end in the very last corner.
+            last = top if ahead is None else max(top, min(top + slack, first[0] - ahead))
+            yield below, _traced(steps, reached, target or nearest_middle(reached[: last + 1], top)), top
+
+
+def _traced(steps: NDArray[np.int8], reached: Bools, end: Cell | None) -> Ints:
+    """Cells (vertex, 2) of the path to an end, empty where that was not reached."""
+    return NO_CELLS if end is None or not reached[end] else trace(steps, end)
+
+
+def _starts(cells: Bools, start: Cell | None, behind: int) -> Bools:
+    """Those of the cells (row, col) where a path may start: the one that is given, else all from row ``behind`` on."""
+    out, where = np.zeros_like(cells), np.s_[behind:] if start is None else start
+    out[where] = cells[where]
+    return out
 
 
 def _check_end(maps: Maps, lattice: Lattice, vehicle: Vehicle, name: str, point: Point) -> None:
@@ -369,7 +388,7 @@ def path_stage(
     maps = {name: np.asarray(risk[name]) for name in risk.arrays}
     ends = (None, None) if local else (params.start, params.target)
     if local and (large := too_large(vehicle, lattice.shape, lattice.cell)):
-        route = Route(np.empty((0, 2), np.int64), np.empty((0, 3)), params.planner, "middle", (0, 0), large)
+        route = Route(NO_CELLS, np.empty((0, 3)), params.planner, "middle", (0, 0), large)
     else:
         route = find_path(maps, lattice, vehicle, ends=ends, stretch=not local, params=params, begin=begin)
     facts = describe(route, maps, lattice, vehicle) | {"frame": risk.meta.get("frame", "local")}

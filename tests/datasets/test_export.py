@@ -35,6 +35,7 @@ def test_round_trip(exported, materialise):
     for a, b in ((back.rig.left, sequence.rig.left), (back.rig.right, sequence.rig.right)):
         np.testing.assert_allclose(a.matrix, b.matrix, rtol=1e-12)
         assert (a.width, a.height) == (b.width, b.height)
+    assert back.vehicle == sequence.vehicle
     np.testing.assert_allclose(back.rig.T_right_left.matrix34, sequence.rig.T_right_left.matrix34, atol=1e-12)
     for a, b in zip(back.truth, sequence.truth, strict=True):
         np.testing.assert_allclose(a.matrix34, b.matrix34, atol=1e-12)

@@ -10,6 +10,7 @@ from typing import Annotated
 from rille.datasets.bags import is_bag
 from rille.datasets.images.pairing import writable
 from rille.datasets.inspection.folder import Findings, inspect
+from rille.datasets.manifest.model import VEHICLE_FILE
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import folder_manifest, hindrance
 from rille.datasets.text.names import derived_name, shell_word
@@ -90,6 +91,7 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
         lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
     tables = {**findings.tables, **({"masks": findings.masks.values()} if findings.masks else {})}
+    tables |= {"vehicle": [VEHICLE_FILE]} if findings.vehicle else {}
     lines += [f"{kind:12s} {', '.join(files)}" for kind, files in tables.items()]
     lines += [f"not read     {line}" for line in findings.unread]
     lines += [f"wrote        {path}"]

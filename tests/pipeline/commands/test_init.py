@@ -15,6 +15,7 @@ from rille.datasets.images.files import Digests
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import hindrance
 from rille.pipeline.commands.sequences.init import init
+from rille.stages.hazard.vehicle import Vehicle
 
 SETTINGS = """%YAML:1.0
 Camera.fx: 60.0
@@ -196,6 +197,25 @@ def test_image_folders_of_raw_recordings_open_with_their_calibration(drive, caps
     (drive / "calib.txt").write_text("\n".join(lines + [f"P_rect_0{k}: {rows[k % 2]}" for k in range(4)]))
     init(drive)
     assert "opens as it is" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[vehicle]\nname = 'a'\ntrack = 0.5\n", "vehicle      vehicle.toml"),
+        ("[vehicle]\ntrack = 'a'\n", "vehicle.track = 'a' is not permitted"),
+        ("vehicle = 3\n", "vehicle.toml: vehicle"),
+        ("track = 0.1\n", "unknown key 'track'"),
+        ("[vehicle\n", "vehicle.toml is not TOML"),
+    ],
+)
+def test_the_vehicle_that_a_file_beside_the_images_states_is_in_the_manifest(drive, capsys, text, line):
+    (drive / "calibration.yaml").write_text(SETTINGS)
+    (drive / "vehicle.toml").write_text(text)
+    init(drive)
+    assert line in capsys.readouterr().out
+    stated = tomllib.loads(Path("drive.rille.toml").read_text()).get("vehicle")
+    assert stated == (Vehicle(name="a", track=0.5).model_dump() if "name" in text else None)
 
 
 def test_places_that_cannot_be_written(drive, tmp_path):

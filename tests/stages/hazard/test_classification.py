@@ -14,6 +14,7 @@ from rille.stages.hazard.classification import (
     LIFT,
     MAX_EXCESS,
     UNKNOWN,
+    UNSEEN_BIT,
     RiskParams,
     _chance,
     classify,
@@ -74,6 +75,25 @@ def test_classes_and_reasons_equal_a_plain_calculation(stride: int) -> None:
     known = ~unknown & (alone["risk"] != UNKNOWN)
     np.testing.assert_array_equal(out["p_wheel"][known], alone["p_hazard"][known])
     assert (out["p_wheel"] <= out["p_hazard"])[known].all()
+
+
+def test_noise_is_that_of_the_ground_below_and_of_the_shorter_side_between_wheels() -> None:
+    z, std = np.zeros((2, 60, 60), np.float32)
+    std[30, 30] = 0.01
+    terrain = HazardInput(z, z, std, 0.005, MODEL, 0.03)
+    # Half of the mean of its length and width, 0.130 and 0.095 m, to either side.
+    rows, cols = np.nonzero(terrain.footprint_noise())
+    assert (rows.min(), rows.max(), cols.min(), cols.max()) == (19, 41, 19, 41)
+    assert {m.name: m.length(terrain) for m in MEASURES if m.name in ("slope", "tilt")} == {"slope": 0.08, "tilt": 0.08}
+
+
+@pytest.mark.parametrize(("window", "unseen"), [(0.03, False), (0.5, True)])
+def test_ground_that_is_unknown_in_the_window_alone_is_unseen(window: float, unseen: bool) -> None:
+    z = np.zeros((120, 120), np.float32)
+    z[50:62, 10:22] = np.nan
+    terrain = HazardInput(z, z, np.zeros_like(z), 0.005, MODEL, window)
+    reason = classify(terrain, np.zeros(z.shape, np.uint8), RULES)["reason"]
+    assert bool(reason[56, 60] & UNSEEN_BIT) == unseen
 
 
 def test_a_new_measure_is_one_row_and_its_kernel() -> None:

@@ -114,6 +114,18 @@ def test_headings_go_once_round_half_a_turn() -> None:
     np.testing.assert_allclose(steps, steps.mean(), atol=0.7)  # rounded to cells of half a millimetre
 
 
+def test_a_wheel_stands_on_a_patch_half_as_wide_and_on_coarse_ground_on_one_cell() -> None:
+    assert [Stance.of(MODEL, MODEL.wheel_diameter / n).wheel_reach for n in (16, 8, 1)] == [4, 2, 1]
+
+
+def test_wheels_on_one_cell_do_not_tilt_the_vehicle() -> None:
+    """The track is less than the cells of a coarse grid."""
+    z = np.tile(np.linspace(0.0, 1.0, 21, dtype=np.float32), (21, 1))
+    narrow = MODEL.model_copy(update={"track": 0.03, "wheel_base": 0.03})
+    found = place(z, z, narrow, 0.05, np.isfinite(z))
+    assert found.tilt.max() == found.slope.max() == 0.0
+
+
 def test_bilinear_weights_and_places() -> None:
     at = Stance.of(MODEL, CELL)
     np.testing.assert_allclose(at.weights.sum(axis=1), 1.0, rtol=1e-6)

@@ -188,6 +188,13 @@ def test_a_closed_hole_is_as_uncertain_as_its_rim_is_uneven() -> None:
     assert (out["risk"][70:80, 97:102] == HAZARDOUS).all()
 
 
+@pytest.mark.parametrize(("wide", "closed"), [(6, True), (7, False)])
+def test_a_hole_is_closed_up_to_its_share_of_a_wheel(wide: int, closed: bool) -> None:
+    z = np.zeros((120, 200))
+    z[40:80, 90 : 90 + wide] = np.nan
+    assert bool(judge(z, max_hole=0.2)["filled"][60, 90 : 90 + wide].all()) == closed
+
+
 def test_a_step_proven_by_few_cells_is_hazardous() -> None:
     z = np.full((100, 120), np.nan)
     z[40:43, 60:63] = 0.0

@@ -252,7 +252,10 @@ def test_a_map_that_is_cut_is_crossed_on_its_longer_side() -> None:
     assert describe(from_start, given, lattice, SHORT)["left_out_m"][1] > 0.70, "the other side is left out"
 
 
-@pytest.mark.parametrize(("y", "closed", "begins"), [(-0.6, False, -0.3), (0.0, False, 0.0), (0.0, True, 0.0)])
+@pytest.mark.parametrize(
+    ("y", "closed", "begins"),
+    [(-0.6, False, -0.3), (0.0, False, 0.0), (0.0, True, 0.0), (-0.26, False, -0.3), (0.58, False, -0.3)],
+)
 def test_a_mission_begins_where_the_rig_began(y: float, closed: bool, begins: float) -> None:
     """The map's first row lies ahead of it after a straight drive, far behind it after an orbit."""
     lattice = Lattice.at(-30, 60, CELL, 91, 61)
@@ -397,21 +400,24 @@ WALLS = {
 }
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize("planner", ["auto", "grid8"])
 @pytest.mark.parametrize("words", [*WALLS, "p_hazard"])
 def test_a_local_path_leads_as_far_as_the_ground_is_known_and_safe_and_says_what_ends_it(
-    words: str, planner: str
+    words: str, planner: str, margin: float
 ) -> None:
     """A wall lies 60 rows ahead of the nearest one; beyond it is more ground than before it."""
     lattice = Lattice.at(-20, 160, CELL, 160, 41)
     risk, z = level(lattice)
-    given = maps(risk, z) | {"p_hazard": np.zeros(lattice.shape, np.float32)}
+    # All ground has the greatest probability that is permitted.
+    given = maps(risk, z) | {"p_hazard": np.full(lattice.shape, 0.1, np.float32)}
+    rover = SHORT.model_copy(update={"margin": margin})
     for name, value in WALLS.get(words, {"p_hazard": 0.3}).items():
         given[name][80:100] = value
-    facts = describe(find_path(given, lattice, SHORT, params=PathParams(planner=planner)), given, lattice, SHORT)
+    facts = describe(find_path(given, lattice, rover, params=PathParams(planner=planner)), given, lattice, rover)
     assert facts["found"]
     assert facts["start"][1] <= lattice.ys()[-1] + 4 * SHORT.half_length, "where the vehicle stands"
-    assert lattice.ys()[99] - 4 * SHORT.half_length < facts["target"][1] < lattice.ys()[99]
+    assert lattice.ys()[99] - 4 * SHORT.half_length - margin < facts["target"][1] < lattice.ys()[99]
     assert facts["ended_by"] == (words if words in WALLS else "ground too uncertain to be called safe")
 
 
@@ -434,6 +440,107 @@ def test_no_path_is_what_does_not_lead_the_length_of_the_vehicle(lengths: float,
     assert facts["found"] is (lengths > 1)
     if lengths < 1:
         assert "ahead" in facts["reason"]
+
+
+LONG = SHORT.model_copy(update={"wheel_base": 0.2 - SHORT.wheel_diameter})
+"""20 cells long."""
+
+
+RIM = 12
+"""Cells of known ground around a map, on which the outline of that vehicle stays."""
+
+
+def closed_to_the_middle(free: np.ndarray) -> tuple[dict[str, np.ndarray], Lattice]:
+    """Ground on which the vehicle's middle, but not a wheel, is kept off all that is not ``free``, with a rim of it."""
+    free = np.pad(free, RIM)
+    lattice = Lattice.at(-free.shape[1] // 2, 100, CELL, *free.shape)
+    return maps(np.where(free, 0, HAZARDOUS), level(lattice)[1], "tilt"), lattice
+
+
+@pytest.mark.parametrize("end", ["start", "target"])
+@pytest.mark.parametrize(("stub", "found"), [(20, True), (21, False)])
+def test_a_path_by_rows_starts_and_ends_within_a_length_of_the_ragged_ends(stub: int, end: str, found: bool) -> None:
+    """The last rows hold a few free cells that lead nowhere."""
+    free = np.ones((100, 41), bool)
+    free[:stub] = False
+    free[: stub - 1, 20] = True
+    given, lattice = closed_to_the_middle(free if end == "target" else free[::-1])
+    route = find_path(given, lattice, LONG, params=PathParams(planner="rows"))
+    assert (len(route.cells) > 0) == found
+    if end == "start":
+        anywhere = find_path(given, lattice, LONG, params=PathParams(planner="grid8"))
+        assert (len(anywhere.cells) > 0) == found
+    if found:
+        rows = (99, stub) if end == "target" else (99 - stub, 0)
+        assert (route.cells[[0, -1], 0] - RIM).tolist() == list(rows)
+    else:
+        assert route.blocking_row == RIM + (stub - 1 if end == "target" else 99 - stub + 1)
+
+
+@pytest.mark.parametrize("stretch", [False, True])
+@pytest.mark.parametrize("planner", ["auto", "rows", "grid8"])
+@pytest.mark.parametrize(("rows", "found"), [(21, True), (20, False)])
+def test_a_path_across_a_map_no_longer_than_the_vehicle_is_none(
+    rows: int, found: bool, planner: str, stretch: bool
+) -> None:
+    lattice = Lattice.at(-20, 100, CELL, rows, 41)
+    given = maps(*level(lattice))
+    route = find_path(given, lattice, LONG, stretch=stretch, params=PathParams(planner=planner))
+    assert (len(route.cells) == 21) == found
+    if not found:
+        assert not len(route.cells)
+        assert "vehicle's length ahead" in route.reason
+        assert (route.blocking_row is None) == (planner != "grid8"), "rows cross the map"
+
+
+@pytest.mark.parametrize("planner", ["auto", "rows", "grid8"])
+def test_only_to_a_target_that_is_asked_for_a_path_may_be_shorter_than_the_vehicle(planner: str) -> None:
+    lattice = Lattice.at(-20, 100, CELL, 100, 41)
+    given, params = maps(*level(lattice)), PathParams(planner=planner)
+    start, target = (tuple(lattice.xy()[row, 20]) for row in (12, 0))
+    assert len(find_path(given, lattice, LONG, ends=(start, target), params=params).cells) == 13
+    assert not len(find_path(given, lattice, LONG, ends=(start, None), stretch=True, params=params).cells)
+
+
+@pytest.mark.parametrize(("stretch", "end"), [(False, (5, 2)), (True, (20, 20))])
+def test_a_stop_goes_as_far_as_ground_leads_and_a_mission_not_into_its_last_corner(
+    stretch: bool, end: tuple[int, int]
+) -> None:
+    free = np.zeros((100, 41), bool)
+    free[20:] = free[5:20, 2] = True
+    route = find_path(*closed_to_the_middle(free), LONG, stretch=stretch, params=PathParams(planner="grid8"))
+    assert tuple(route.cells[-1] - RIM) == end
+
+
+def test_on_a_short_map_a_path_by_rows_goes_into_the_last_corner() -> None:
+    free = np.zeros((40, 41), bool)
+    free[10:] = free[:10, 2] = True
+    route = find_path(*closed_to_the_middle(free), LONG, params=PathParams(planner="rows"))
+    assert (route.cells[-1] - RIM).tolist() == [0, 2]
+
+
+def test_a_path_by_rows_begins_in_its_place_however_dear_that_ground_is() -> None:
+    free = np.ones((60, 41), bool)
+    given, lattice = closed_to_the_middle(free)
+    given["risk"][RIM + 45 : RIM + 60, RIM:-RIM] = CAUTION
+    route = find_path(given, lattice, LONG, params=PathParams(planner="rows", caution_cost=10.0))
+    assert (route.cells[0] - RIM).tolist() == [59, 20]
+
+
+def test_of_rows_that_all_but_the_last_can_be_entered_the_last_one_blocks() -> None:
+    free = np.ones((60, 41), bool)
+    free[0, 1:] = free[1, :10] = False
+    given, lattice = closed_to_the_middle(free)
+    ends = (None, tuple(lattice.xy()[RIM, RIM]))
+    route = find_path(given, lattice, LONG, ends=ends, params=PathParams(planner="rows"))
+    assert (route.blocking_row, route.reason) == (RIM, "hazardous or unknown ground closes the whole width")
+
+
+def test_a_mission_goes_into_the_last_corner_where_it_else_led_no_length_ahead() -> None:
+    free = np.zeros((100, 41), bool)
+    free[10:30] = free[:10, 2] = free[90:] = True
+    route = find_path(*closed_to_the_middle(free), LONG, stretch=True)
+    assert (route.cells[[0, -1]] - RIM).tolist() == [[29, 20], [0, 2]]
 
 
 def test_a_local_path_goes_round_what_closes_the_rows() -> None:
