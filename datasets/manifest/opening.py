@@ -25,7 +25,7 @@ from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import Search, meant, read_bytes
+from rille.datasets.text.reading import Search, nearest_hint, read_bytes
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import IncompleteError, InputError, within
 
@@ -215,7 +215,9 @@ def find_pairs(images: Images, root: Path, lines: list[str], digests: files.Dige
         if not paths:
             within_root = "" if pattern.startswith("/") else f" in {root}"
             text = "; ".join([f"images.{side} = {pattern!r} finds no file{within_root}", *search.closed[:1]])
-            raise IncompleteError("RIL-217", text, remedy=f"{meant(root / pattern)}correct the pattern, root or rights")
+            raise IncompleteError(
+                "RIL-217", text, remedy=f"{nearest_hint(root / pattern)}correct the pattern, root or rights"
+            )
         found.append(paths)
     left, right = found
     if both := sorted(set(left) & set(right)):

@@ -90,7 +90,7 @@ def open_regular(path: Path, what: str, most: int) -> BufferedReader:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error  # a path with a zero byte
         text = f"{what} {path} cannot be read: {missing_target(path) or reason}"
-        remedy = "name a file in it" if os.path.isdir(path) else f"{meant(path)}check the path and its rights"
+        remedy = "name a file in it" if os.path.isdir(path) else f"{nearest_hint(path)}check the path and its rights"
         raise InputError("RIL-138", text, remedy=remedy) from error
     if status.st_size <= most:
         text = f"{what} {path} is a pointer of Git LFS or git-annex; its content is elsewhere"
@@ -110,7 +110,7 @@ def missing_target(path: str | Path, name: str = "it") -> str:
     return f"{name} is a link to {os.readlink(path)}, which is missing" if broken else ""
 
 
-def meant(path: Path) -> str:
+def nearest_hint(path: Path) -> str:
     """What may be meant by the path, or pattern, of a missing file, as the beginning of a remedy; empty: unknown."""
     if FOREIGN.search(str(path)):
         return "write / between folders, not \\, and * for a number that changes, not %06d; "

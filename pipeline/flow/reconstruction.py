@@ -197,8 +197,8 @@ def tracked(
 def attempted(
     make: Builder, frames: Series[int], whole: list[int], screening: Ref[ScreeningFacts], learnt: Learnt
 ) -> Generator[Wait, Any, Tracked | Learnt | None]:
-    """One attempt at :func:`tracked` by what is ``learnt``. What shows a further image that the tracks contradict, a
-    knock of the rig, or a wrong calibration, ends it: then it returns what is learnt by that."""
+    """One attempt at :func:`tracked` by what earlier ones have ``learnt``. It ends early, with what is learnt then, at
+    images that the tracks contradict, a knock of the rig, or a wrong calibration."""
     p = make.products
     if learnt.corrections and p.crosscheck is not None:
         p.crosscheck = crosscheck_tasks(make, whole)

@@ -18,8 +18,8 @@ from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray
 from rille.stages.geometry.epipolar import MAX_LINE_DISTANCE_PX
 from rille.stages.geometry.projection import product
+from rille.stages.geometry.scale import common_similarity
 from rille.stages.hfvm.image import thinned
-from rille.stages.odometry.displacements import common_similarity
 
 MIN_MATCHES = 100
 """Fewest matches that are judged."""

@@ -1,6 +1,7 @@
 """Scale of the right image of a pair: pixels of the right image for each pixel of the left one.
 
-Two cameras may have pixels or lenses of unlike size, and two images may, without any calibration.
+Two cameras may have pixels or lenses of unlike size, and two images may, without any calibration; matches show it, with
+the turn between the images.
 """
 
 from __future__ import annotations
@@ -53,3 +54,20 @@ def other_size(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
     """Whether images of two shapes, without a calibration, may show things in unlike size."""
     # 1.3: ratio above which they may be so unlike in size that nothing matches.
     return any(max(m, n) > 1.3 * min(m, n) for m, n in zip(a, b, strict=True))
+
+
+def common_similarity(origin: Floats, moved: Floats) -> Floats:
+    """Rotation and scale (2, 2) in the image that pairs (n, 2) share.
+
+    The mean turn and the median stretch of the lines between pairs, all lines counting alike.
+    """
+    # Lines between pairs half the list apart, as complex numbers: a quotient is a turn and a stretch.
+    p, q = ((a - np.roll(a, len(a) // 2, axis=0)) @ np.array([1.0, 1.0j]) for a in (origin, moved))
+    long = (np.abs(p) > 0) & (np.abs(q) > 0)
+    ratio = q[long] / p[long]
+    # A mean of unit vectors, since angles have no mean across half a turn; outliers are few and of length 1.
+    mean = (ratio / np.abs(ratio)).sum()
+    if np.abs(mean) == 0:
+        return np.eye(2)
+    turn = np.median(np.abs(ratio)) * mean / np.abs(mean)
+    return np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])

@@ -1,4 +1,4 @@
-"""Sums and means over moving windows of a raster.
+"""Sums, means and correlations over moving windows of a raster.
 
 Windows are square, centred and of odd side ``n``; cells outside of the raster do not count.
 """
@@ -54,3 +54,13 @@ def window_mean(a: Floats32, n: int) -> Floats32:
     np.divide(total, count, out=total, where=count > 0)
     np.add(total, middle, out=mean, where=count > 0, casting="same_kind")
     return mean
+
+
+def window_correlation(a: Floats32, b: Floats, n: int) -> Floats:
+    """Correlation (row, col) of two images 0..255 in the window; NaN where an image is not known or is uniform."""
+    both = np.where(np.isnan(b), np.nan, 1.0)
+    # Less a level near the middle, for smaller rounding errors.
+    x, y = ((image - 128.0) * both for image in (a, b))
+    mean_a, mean_b, ab, aa, bb = (window_mean(m.astype(np.float32), n) for m in (x, y, x * y, x * x, y * y))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray((ab - mean_a * mean_b) / np.sqrt((aa - mean_a**2) * (bb - mean_b**2)), np.float64)

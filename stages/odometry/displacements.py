@@ -14,6 +14,7 @@ from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.validity import Mask
 from rille.stages.facts.odometry import MotionFacts
+from rille.stages.geometry.scale import common_similarity
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 
@@ -82,23 +83,6 @@ def fit_affinity(origin: Floats, moved: Floats, use: Bools, at: Floats) -> tuple
     # 5.0: spread [pixels] of the neighbours below which they do not determine a change of shape.
     fitted = irls(design, shift, weights, count * np.diag([5.0**2, 5.0**2, 0.0]), rounds=4)
     return common + np.swapaxes(fitted[:, :2], 1, 2), fitted[:, 2]
-
-
-def common_similarity(origin: Floats, moved: Floats) -> Floats:
-    """Rotation and scale (2, 2) in the image that pairs (n, 2) share.
-
-    The mean turn and the median stretch of the lines between pairs, all lines counting alike.
-    """
-    # Lines between pairs half the list apart, as complex numbers: a quotient is a turn and a stretch.
-    p, q = ((a - np.roll(a, len(a) // 2, axis=0)) @ np.array([1.0, 1.0j]) for a in (origin, moved))
-    long = (np.abs(p) > 0) & (np.abs(q) > 0)
-    ratio = q[long] / p[long]
-    # A mean of unit vectors, since angles have no mean across half a turn; outliers are few and of length 1.
-    mean = (ratio / np.abs(ratio)).sum()
-    if np.abs(mean) == 0:
-        return np.eye(2)
-    turn = np.median(np.abs(ratio)) * mean / np.abs(mean)
-    return np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from rille.stages.core.declare import Bundle, Params, raster, stage
 from rille.stages.core.validity import Validity, defined, mark, matched, matched_share
 from rille.stages.facts.imaging import PyramidFacts
 from rille.stages.facts.odometry import MotionFacts
+from rille.stages.geometry.scale import common_similarity
 from rille.stages.hfvm import plane
 from rille.stages.hfvm.image import as_matched
 from rille.stages.hfvm.level import PyramidPair, Recipe, descend, fill_rows, median, propagate, search
@@ -27,7 +28,7 @@ from rille.stages.hfvm.native.problem import LevelPair
 from rille.stages.hfvm.native.solver import solver
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.odometry.displacements import Motion, common_similarity
+from rille.stages.odometry.displacements import Motion
 
 
 class MotionParams(Params):

@@ -14,7 +14,7 @@ from rille.datasets.images import files
 from rille.datasets.images.headers import Header, read_header
 from rille.datasets.registry import open_sequence
 from rille.datasets.text import reading
-from rille.datasets.text.reading import Search, meant, read_bytes, read_lines, read_toml
+from rille.datasets.text.reading import Search, nearest_hint, read_bytes, read_lines, read_toml
 from rille.stages.core.errors import InputError
 
 
@@ -62,7 +62,7 @@ def test_the_nearest_name_is_asked_for(tmp_path, path, hint):
     (tmp_path / "calib").mkdir()
     (tmp_path / "calib" / "stereo.yml").touch()
     (tmp_path / "calib" / "stereo\n.yml").touch()
-    assert hint in f"{meant(tmp_path / path)}correct"
+    assert hint in f"{nearest_hint(tmp_path / path)}correct"
 
 
 def test_sizes_lines_and_content_are_bounded(tmp_path):

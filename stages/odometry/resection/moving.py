@@ -24,7 +24,7 @@ from rille.stages.facts.odometry import MotionFacts, MovingFacts
 from rille.stages.geometry.geometry import Rig, RigidTransform
 from rille.stages.geometry.scale import right_pixels
 from rille.stages.imaging.pyramid import Pyramid
-from rille.stages.numeric.windows import window_mean
+from rille.stages.numeric.windows import window_correlation
 from rille.stages.odometry.resection.landmarks import triangulated
 
 
@@ -85,17 +85,7 @@ def departures(
     own, other = images[::-1] if back else images
     seen = _at(other, (there + 0.5) / scale - 0.5, cv2.INTER_LINEAR).reshape(shape)
     # A match of what has left the view is one of chance.
-    return np.where(_correlation(own, seen) <= ALIKE, off, np.nan)
-
-
-def _correlation(a: Floats32, b: Floats) -> Floats:
-    """Correlation (row, col) of both images in windows of 5 x 5; NaN where an image is not known or is uniform."""
-    both = np.where(np.isnan(b), np.nan, 1.0)
-    # Less a level near the middle, for smaller rounding errors.
-    x, y = ((image - 128.0) * both for image in (a, b))
-    mean_a, mean_b, ab, aa, bb = (window_mean(m.astype(np.float32), 5) for m in (x, y, x * y, x * x, y * y))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((ab - mean_a * mean_b) / np.sqrt((aa - mean_a**2) * (bb - mean_b**2)), np.float64)
+    return np.where(window_correlation(own, seen, 5) <= ALIKE, off, np.nan)
 
 
 def _disparities(disparity: Bundle, pixels: NDArray[np.intp]) -> Floats:

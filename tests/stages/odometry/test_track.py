@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, check_outputs
+from rille.stages.geometry.scale import common_similarity
 from rille.stages.imaging.pyramid import PyramidParams, build
 from rille.stages.odometry import track as tracking
-from rille.stages.odometry.displacements import Motion, common_similarity, fit_affinity, known_median
+from rille.stages.odometry.displacements import Motion, fit_affinity, known_median
 from rille.stages.odometry.track import (
     TrackParams,
     track,
