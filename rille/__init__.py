@@ -1,8 +1,8 @@
 """Stereo image sequences to terrain, trajectory, risk map and safe path.
 
 One pair, step by step: ``open``, ``match``, ``points``, ``terrain``, ``hazards``, ``path``
-(:mod:`rille.pipeline.steps`). Whole sequences: ``reconstruct``, ``reconstruct_many``, ``open_run``
-(:mod:`rille.pipeline.api`).
+(:mod:`rille.pipeline.python.steps`). Whole sequences: ``reconstruct``, ``reconstruct_many``, ``open_run``
+(:mod:`rille.pipeline.python.runs`).
 """
 
 # Not even `__future__` is imported here: `python -m rille` looks for it in the current folder first, and until
@@ -11,8 +11,9 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from rille.pipeline.api import Run, open_run, reconstruct, reconstruct_many
-    from rille.pipeline.steps import StereoPair, StereoSequence, hazards, match, open, path, points, terrain
+    from rille.pipeline.python.runs import Run, open_run, reconstruct, reconstruct_many
+    from rille.pipeline.python.sequence import StereoPair, StereoSequence, open
+    from rille.pipeline.python.steps import hazards, match, path, points, terrain
     from rille.stages.core.errors import RilleError
 
     __version__: str
@@ -46,6 +47,7 @@ def __getattr__(name: str) -> "Any":
     if name not in __all__:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     # Loaded at first use: `import rille` must not import NumPy before threads are set.
-    runs = ("Run", "open_run", "reconstruct", "reconstruct_many")
-    homes = {"RilleError": "stages.core.errors"} | dict.fromkeys(runs, "pipeline.api")
-    return getattr(import_module(f"rille.{homes.get(name, 'pipeline.steps')}"), name)
+    homes = {"RilleError": "stages.core.errors"}
+    homes |= dict.fromkeys(("Run", "open_run", "reconstruct", "reconstruct_many"), "pipeline.python.runs")
+    homes |= dict.fromkeys(("StereoPair", "StereoSequence", "open"), "pipeline.python.sequence")
+    return getattr(import_module(f"rille.{homes.get(name, 'pipeline.python.steps')}"), name)

@@ -29,8 +29,7 @@ FLOORS = (
     "rille.pipeline.export",
     "rille.pipeline.report",
     "rille.pipeline.runs",
-    "rille.pipeline.steps",
-    "rille.pipeline.api",
+    "rille.pipeline.python",
     "rille.pipeline.commands",
     "rille.pipeline",
 )

@@ -19,7 +19,6 @@ from pydantic import TypeAdapter
 from raising import raises
 from terrain_runs import finished
 
-from rille.pipeline.api import open_run
 from rille.pipeline.cli import main
 from rille.pipeline.engine.runtime.hints import read_hint
 from rille.pipeline.engine.store.base import Store
@@ -28,6 +27,7 @@ from rille.pipeline.export.output import unpack
 from rille.pipeline.export.programs import rocrate
 from rille.pipeline.export.programs.run_artifacts import export_run
 from rille.pipeline.export.read_dem import frames_of, read_elevation
+from rille.pipeline.python.runs import open_run
 from rille.pipeline.runs import crate
 from rille.stages.core.declare import Bundle
 
@@ -158,7 +158,7 @@ def test_a_fault_of_the_program_is_not_told_as_one_of_the_run(run: Path, capsys:
     def broken(*_: Any) -> Any:
         raise ValueError("own")
 
-    monkeypatch.setattr("rille.pipeline.api.Run.file", broken)
+    monkeypatch.setattr("rille.pipeline.python.runs.Run.file", broken)
     assert told(capsys, "view", "seq/2") == (1, ["RIL-999"])
 
 

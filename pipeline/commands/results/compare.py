@@ -13,7 +13,7 @@ import numpy as np
 
 from rille.datasets.manifest.opening import dotted
 from rille.datasets.text.reading import read_toml
-from rille.pipeline import api
+from rille.pipeline.python import runs as opened
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.quantities import metres, quantity
@@ -29,7 +29,7 @@ def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> None:
     one, other = both = lookup.find(a, runs), lookup.find(b, runs)
     # Read all before anything is printed.
     with lookup.reading(*both):
-        reports = [api.Run(run).report for run in both]
+        reports = [opened.Run(run).report for run in both]
         settings = [dict(dotted(read_toml(run / "config.toml", "configuration"))) for run in both]
         lines = [*_parameters(*settings), *_tasks(*both), *_figures(*reports), _positions(*both)]
     heads = [f"{letter} {lookup.name(run)}" for letter, run in (("A", one), ("B", other))]
@@ -95,7 +95,7 @@ def _in_words(metric: Mapping[str, Any] | None) -> str:
 def _positions(a: Path, b: Path) -> str:
     if not all((run / "trajectory.kitti").exists() for run in (a, b)):
         return "positions     not both runs have a trajectory"
-    one, other = (api.Run(run).trajectory for run in (a, b))
+    one, other = (opened.Run(run).trajectory for run in (a, b))
     _, rows, others = np.intersect1d(one.time, other.time, return_indices=True)
     posed, also = (np.isfinite(run.position.values).all(axis=1) for run in (one, other))
     known = posed[rows] & also[others]

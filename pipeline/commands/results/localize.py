@@ -14,7 +14,6 @@ from cyclopts.validators import Number
 from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline import api
 from rille.pipeline.commands.results.run_terrain import Terrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
@@ -29,6 +28,7 @@ from rille.pipeline.export.read_dem import (
     refuse_unlike_systems,
 )
 from rille.pipeline.export.writers import ENGINEERING_CRS, write_json, write_trajectory_tum
+from rille.pipeline.python import runs as opened
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
 from rille.stages.core.declare import Bundle
@@ -244,7 +244,7 @@ def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store
     """Write trajectory and path in the map's coordinates; yield the files."""
     words = f"of the map{f', {crs_name(crs)}' if crs else ''}: T_map_world of {output_file(output, '.json').name}"
     if (folder / "trajectory.kitti").exists():
-        known = api.Run(folder).trajectory
+        known = opened.Run(folder).trajectory
         turned, there = found.pose.rotation @ known["rotation"].values, found.pose.apply(known["position"].values)
         poses = np.concatenate([turned, there[..., None]], axis=2)
         write_trajectory_tum(output_file(output, ".tum"), poses, known["time"].values.tolist(), words)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.api import Run
 from rille.pipeline.export.read_dem import frames_of, georeference_in, no_ground
+from rille.pipeline.python.runs import Run
 from rille.pipeline.runs import lookup
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError

@@ -91,9 +91,9 @@ def by_stage(run: Path) -> Iterator[str]:
 
 def view(run: Run = "latest", *, runs: Runs = RUNS) -> None:
     """Open the report of a run in the browser; print its path."""
-    from rille.pipeline import api  # imports NumPy, which a list does not need
+    from rille.pipeline.python.runs import open_run  # imports NumPy, which a list does not need
 
-    opened = api.open_run(run, runs)
+    opened = open_run(run, runs)
     page = opened.file("report.html")
     # Over SSH a text browser might take the terminal.
     if sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):

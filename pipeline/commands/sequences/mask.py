@@ -11,8 +11,8 @@ import numpy as np
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.names import shell_word
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.python.sequence import open as open_sequence
 from rille.pipeline.runs.options import Output, check_new
-from rille.pipeline.steps import open as open_sequence
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
 from rille.stages.imaging.pyramid import grey

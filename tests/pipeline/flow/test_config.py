@@ -10,7 +10,7 @@ from raising import raises
 
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.flow import config
-from rille.pipeline.steps import assignments
+from rille.pipeline.python.arguments import assignments
 
 
 def test_layers_win_in_order() -> None:

@@ -19,257 +19,27 @@ their attributes carry the facts and settings that the next step needs.
 
 from __future__ import annotations
 
-import json
-import os
 import warnings
-import zlib
-from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Series
-from dataclasses import dataclass, field, replace
-from os.path import expanduser
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import tomli_w
-from numpy.typing import NDArray
 
-from rille.datasets import registry
-from rille.datasets.images.files import sound
-from rille.datasets.protocol import CAMERAS, Sequence
+from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import read_toml
-from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import prepare_environment
-from rille.pipeline.engine.spec import map_ports
-from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
 from rille.pipeline.flow import config
-from rille.stages.core.declare import AnyArray, Array, Bundle, Stage
+from rille.pipeline.python.arguments import Settings, check_sections, place_of
+from rille.pipeline.python.datasets import bundle_of, dataset_of, merged, noted, settings_of
+from rille.pipeline.python.sequence import StereoPair, builder, checksum, computed, image_of
+from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.errors import ConfigError, InputError, warning
 from rille.stages.core.validity import Validity
-from rille.stages.geometry.geometry import Rig
 
 if TYPE_CHECKING:
     import xarray
-
-    from rille.pipeline.flow.builders import Builder
-
-Settings = Mapping[str, Any]
-Known = dict[Handle, Bundle]
-
-
-ELSEWHERE: Mapping[str, str] = {
-    "column_disparity": "; disparities of another program are read by [disparity] of a manifest",
-    "elevation": "; rille.reconstruct(..., vehicle={...}) judges the terrain of a run anew",
-}
-"""Where data of another origin than the step before are taken, by the variable of that step."""
-
-
-@dataclass(frozen=True)
-class StereoSequence:
-    """A calibrated stereo sequence; ``sequence[k]`` is its pair number k, from 0, ``len(sequence)`` how many there are.
-
-    ``sequence[START:STOP]`` and a loop give pairs whose images can be used; of any other pair ``sequence[k]`` raises
-    ``InputError`` with the cause.
-
-    Attributes
-    ----------
-    drawn : images that were read or rendered already, by label.
-    """
-
-    source: Sequence
-    drawn: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
-
-    def __repr__(self) -> str:
-        return f"<StereoSequence {self.name}: {len(self)} pairs>"
-
-    def __reduce__(self) -> tuple[Callable[..., StereoSequence], tuple[str, ...]]:
-        # How its images come about cannot be pickled; another process opens it anew.
-        return _reopened, self.source.opened
-
-    @property
-    def name(self) -> str:
-        """Short name, also of the folder of its runs."""
-        return self.source.name
-
-    @property
-    def rig(self) -> Rig:
-        """The cameras, without lens distortion, and how they stand to each other, as given.
-
-        ``rig.left`` and ``rig.right`` have ``fx``, ``fy``, ``cx``, ``cy``, ``width`` and ``height`` (px);
-        ``rig.T_right_left`` maps the left camera's frame to the right one's (x right, y down, z ahead, m), and
-        ``rig.baseline`` is their distance (m).
-        """
-        return self.source.rig
-
-    def __len__(self) -> int:
-        return self.source.frames
-
-    @overload
-    def __getitem__(self, frame: int) -> StereoPair: ...
-    @overload
-    def __getitem__(self, frame: slice) -> list[StereoPair]: ...
-    def __getitem__(self, frame: int | slice) -> StereoPair | list[StereoPair]:
-        try:
-            number = range(len(self))[frame]
-        except IndexError:
-            raise IndexError(f"pair {frame} of {len(self)}") from None
-        except (TypeError, ValueError):
-            text = f"{frame!r:.80} is no number of a pair"
-            raise InputError("RIL-747", text, remedy="give a whole number, or START:STOP[:STEP]") from None
-        if isinstance(number, range):
-            return [StereoPair(self, k) for k in number if k not in self.source.lost]
-        if number in self.source.lost:
-            text = f"frame {number} of {self.name}: {self.source.lost[number]}"
-            raise InputError("RIL-863", text, remedy="take another frame")
-        return StereoPair(self, number)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return iter(self[:])
-
-
-@dataclass(frozen=True)
-class StereoPair:
-    """Both images of a pair, free of lens distortion, and what is known of it."""
-
-    sequence: StereoSequence
-    frame: int
-
-    @property
-    def left(self) -> xarray.DataArray:
-        """Left image (row, col), grey values as :func:`match` takes them.
-
-        Where its coordinate ``valid`` (row, col) is 0 a pixel is not used.
-        """
-        return self._image("left")
-
-    @property
-    def right(self) -> xarray.DataArray:
-        """Right image (row, col), as :attr:`left`."""
-        return self._image("right")
-
-    def taken(self, camera: str) -> NDArray[Any]:
-        """Grey values (row, col) of the image of camera ``"left"`` or ``"right"`` as taken, with its lens distortion.
-
-        Raises
-        ------
-        ConfigError
-            There is no such camera.
-        """
-        if camera not in CAMERAS:
-            raise ConfigError("RIL-748", f"there is no camera {camera!r:.80}", remedy="give 'left' or 'right'")
-        image = _computed(_builder(self, self.settings).raw_image(self.frame, camera), {}, self.sequence.drawn)
-        return np.array(image["image"])
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Parameters that suit the sequence, by section; those given to a function come before them."""
-        return config.suited(self.sequence.source)
-
-    def _bundle(self, camera: str) -> Bundle:
-        return _computed(_builder(self, self.settings).image(self.frame, camera), {}, self.sequence.drawn)
-
-    def _image(self, camera: str) -> xarray.DataArray:
-        import xarray
-
-        image = self._bundle(camera)
-        valid = image.arrays.get("valid")
-        return xarray.DataArray(
-            np.array(image["image"]),  # a copy: what a user draws into it must not reach the next step
-            dims=("row", "col"),
-            coords={} if valid is None else {"valid": (("row", "col"), np.asarray(valid))},
-            name=f"{camera}_image",
-            attrs={
-                "units": "1",
-                "long_name": f"{camera} image of pair {self.frame}",
-                **_carried({}, self.settings, [self._mark(camera)]),
-            },
-        )
-
-    def _mark(self, camera: str) -> int:
-        """Checksum of an image, by which a disparity of others is known."""
-        return zlib.crc32(np.asarray(self._bundle(camera)["image"]).tobytes())
-
-
-def open(path: str | Path, **settings: Settings) -> StereoSequence:
-    """Open a sequence of stereo pairs.
-
-    Parameters
-    ----------
-    path
-        A name from ``rille datasets list``, a folder, or a manifest.
-    settings
-        Parameters of the sequence by section, e.g. ``mockup={"frames": 5}``.
-
-    Returns
-    -------
-    StereoSequence
-        Its pairs; an image is read or rendered when it is asked for.
-
-    Raises
-    ------
-    InputError
-        There is no such sequence, or it cannot be used.
-    ConfigError
-        A parameter is unknown, or not permitted.
-
-    Examples
-    --------
-    >>> import rille
-    >>> sequence = rille.open("mockup-short")
-    >>> len(sequence), sequence[0].left.dims
-    (9, ('row', 'col'))
-    """
-    words = assignments(settings)
-    place = place_of(path, "path")
-    opened = registry.open_sequence(place, config.merge({}, settings))
-    # Opened anew by another process, or after the program has changed its folder, it is the same one.
-    same = place if place in (*registry.BUILT_IN, *registry.MANIFESTS) else os.path.abspath(place)
-    said = (word for one in words for word in ("--set", one))
-    return StereoSequence(replace(opened, opened=(same, *said)))
-
-
-def _reopened(path: str, *assigned: str) -> StereoSequence:
-    """The sequence of ``Sequence.opened``: its path, and its settings as ``--set section.key=value``."""
-    return open(path, **config.parse_assignments(assigned[1::2]))
-
-
-def place_of(path: object, name: str) -> str:
-    """A name or path as a command line has it, from argument ``name``; what can be none is refused."""
-    if not isinstance(path, str | Path) or "\0" in str(path):
-        remedy = "give a text or a Path"
-        if name == "seq":
-            remedy += ", or what rille.open returns, with frames='START:STOP' for a part of it"
-        raise InputError("RIL-970", f"{name}={path!r:.80} is no name or path", remedy=remedy)
-    return expanduser(path)
-
-
-def check_sections(settings: Mapping[str, object]) -> None:
-    """Refuse a parameter that is given without its section."""
-    for section, values in settings.items():
-        if not isinstance(values, Mapping):
-            text = f"{section}={values!r} is no section of parameters"
-            raise ConfigError("RIL-861", text, remedy='give them by section, e.g. locus={"cell_size": 0.002}')
-
-
-def assignments(settings: Mapping[str, Settings]) -> list[str]:
-    """Return the same settings as assignments for ``--set``.
-
-    >>> assignments({"locus": {"cell_size": 0.002, "both": True}, "drive": {"goal": (0.1, 2.0)}})
-    ['locus.cell_size=0.002', 'locus.both=true', 'drive.goal=[ 0.1, 2.0, ]']
-    """
-    words = []
-    check_sections(settings)
-    for section, values in config.merge({}, settings).items():
-        for name, value in values.items():
-            try:
-                lines = tomli_w.dumps({"v": value}).removeprefix("v = ").splitlines()
-            except TypeError:
-                text = f"{section}.{name} = {value!r} is no value of TOML"
-                remedy = "give a number, a text, True or False, or a list of these; or leave it out"
-                raise ConfigError("RIL-866", text, remedy=remedy) from None
-            # Only a list has several lines: the line feed of a text is escaped.
-            words.append(f"{section}.{name}={' '.join(line.strip() for line in lines)}")
-    return words
 
 
 def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
@@ -320,7 +90,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
 
-    carried, marks = _settings(left), [mark for image in (left, right) for mark in _noted(image).get("images", [None])]
+    carried, marks = settings_of(left), [mark for image in (left, right) for mark in noted(image).get("images", [None])]
     built: Any = config.build(carried, {"hfvm": hfvm})
     left, right = map(_rows_first, (left, right))
     images = [_pixels(image) for image in (left, right)]
@@ -343,7 +113,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     meta = facts(disparity.arrays, built.hfvm, disparity.unlike, int(np.count_nonzero(first.valid[0])))
     for line in (*spread, *doubts(disparity, *images, closely=False)):
         warnings.warn(line, stacklevel=2)
-    return _dataset(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}), marks)
+    return dataset_of(hfvm_stage, Bundle(disparity.arrays, meta), config.merge(carried, {"hfvm": hfvm}), marks)
 
 
 def _pixels(image: Any) -> AnyArray:
@@ -417,7 +187,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
     if every not in range(1, 100_000):
         raise ConfigError("RIL-867", f"every = {every!r:.80} is no step of rows", remedy="give a whole number from 1")
     given = _disparity(disparity, pair)
-    built: Any = config.build(_merged(disparity, pair.settings, {}))
+    built: Any = config.build(merged(disparity, pair.settings, {}))
     std = np.full(given["validity"].shape, built.locus.sigma_disparity)
     found = points_of(replace(given, arrays={"disparity_std": std, **given.arrays}), pair.sequence.rig, int(every))
     return xarray.Dataset(
@@ -425,7 +195,7 @@ def points(disparity: xarray.Dataset, pair: StereoPair, every: int = 1) -> xarra
             "position": (("point", "xyz"), found.position, {"units": "m", "frame": "left camera"}),
             "sigma_along": ("point", found.sigma_along, {"units": "m"}),
             "sigma_across": ("point", found.sigma_across, {"units": "m"}),
-            "colour": (("point", "rgb"), colours(found.pixel, pair._bundle("left"))),
+            "colour": (("point", "rgb"), colours(found.pixel, image_of(pair, "left"))),
             "pixel": (("point", "uv"), found.pixel, {"units": "px"}),
         }
     )
@@ -438,13 +208,13 @@ def _disparity(disparity: xarray.Dataset, pair: object) -> Bundle:
     if not isinstance(pair, StereoPair):
         text = f"pair is a {type(pair).__name__}"
         raise InputError("RIL-674", text, remedy="give one pair of a sequence: rille.open(...)[0]")
-    given = _bundle(disparity, hfvm_stage, ("column_disparity", "row_disparity"), "rille.match")
+    given = bundle_of(disparity, hfvm_stage, ("column_disparity", "row_disparity"), "rille.match")
     size = pair.sequence.rig.left.height, pair.sequence.rig.left.width
     if disparity.column_disparity.shape != size:
         text = f"disparity of {disparity.column_disparity.shape} pixels, the pair's images have {size}"
         raise InputError("RIL-865", text, remedy="give the disparity that rille.match finds for this pair")
-    for camera, mark in zip(CAMERAS, _noted(disparity).get("images", ()), strict=False):
-        if mark is not None and mark != pair._mark(camera):  # None: of an array of the user's own
+    for camera, mark in zip(CAMERAS, noted(disparity).get("images", ()), strict=False):
+        if mark is not None and mark != checksum(pair, camera):  # None: of an array of the user's own
             text = f"the disparity was not found in the {camera} image of pair {pair.frame} of {pair.sequence.name}"
             line = f"{text}: unless that shows the same, give the pair whose images rille.match was given"
             warnings.warn(warning("RIL-796", line), stacklevel=3)
@@ -518,16 +288,16 @@ def terrain(
     from rille.stages.terrain.locus import stage as locus_stage
 
     given = _disparity(disparity, pair)
-    settings = _merged(disparity, pair.settings, {"terrain": {"reference": reference}, "locus": locus})
-    make = _builder(pair, settings)
+    settings = merged(disparity, pair.settings, {"terrain": {"reference": reference}, "locus": locus})
+    make = builder(pair, settings)
     _, known = make.rig([pair.frame])
     at, done = vertical(make, pair.frame), {make.disparity(pair.frame): given}
     level = make.level(pair.frame, at, known)
-    plane = other_plane(make.config, [_computed(level, done, pair.sequence.drawn).meta], placed=False)
+    plane = other_plane(make.config, [computed(level, done, pair.sequence.drawn).meta], placed=False)
     if plane is not None:
         level = make.level(pair.frame, at, known, plane)
-    dem = _computed(make.pair(pair.frame, level, known, None).dem, done, pair.sequence.drawn)
-    return _dataset(locus_stage.locus_stage, dem, settings)
+    dem = computed(make.pair(pair.frame, level, known, None).dem, done, pair.sequence.drawn)
+    return dataset_of(locus_stage.locus_stage, dem, settings)
 
 
 def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, **risk: Any) -> xarray.Dataset:
@@ -581,15 +351,15 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
     elif vehicle is not None:
         check_sections({"vehicle": vehicle})
         limits = dict(vehicle)
-    settings = _merged(dem, {"vehicle": limits, "risk": risk})
+    settings = merged(dem, {"vehicle": limits, "risk": risk})
     built: Any = config.build(settings)
     args = {"vehicle": built.vehicle.model_dump(mode="json", exclude={"name"})}
-    given = _bundle(dem, locus_stage.locus_stage, ("elevation",), "rille.terrain", {})
+    given = bundle_of(dem, locus_stage.locus_stage, ("elevation",), "rille.terrain", {})
     if "reference" in given.meta:
         text = "the elevations are distances from a plane that is no ground, so nothing can drive there"
         raise InputError("RIL-386", text, remedy="if it is ground, state its normal as world.up in the manifest")
     hazards = risk_stage.risk_stage.run(built.risk, args, {"dem": [given]})
-    return _dataset(risk_stage.risk_stage, hazards, settings)
+    return dataset_of(risk_stage.risk_stage, hazards, settings)
 
 
 def path(
@@ -641,126 +411,10 @@ def path(
     from rille.stages.planning import path as path_stage
 
     ends = {name: end for name, end in (("target", goal), ("start", start)) if end is not None}
-    settings = _merged(hazards, {"path": {**path, **ends}})
+    settings = merged(hazards, {"path": {**path, **ends}})
     built: Any = config.build(settings)
     needs = "risk", "reason", "elevation"
-    given = _bundle(hazards, risk_stage.risk_stage, needs, "rille.hazards", risk_stage.NOTHING)
+    given = bundle_of(hazards, risk_stage.risk_stage, needs, "rille.hazards", risk_stage.NOTHING)
     asked = built.path.start is not None or built.path.target is not None
     planned = path_stage.path_stage.run(built.path, {} if asked else {"use": "local"}, {"risk": given})
-    return _dataset(path_stage.path_stage, planned, settings)
-
-
-# -- tasks in this process ----------------------------------------------------------------------------------------
-
-
-def _builder(pair: StereoPair, settings: Settings) -> Builder:
-    prepare_environment()
-    from rille.pipeline.flow.builders import Builder
-
-    return Builder(Graph(), pair.sequence.source, config.build(settings))
-
-
-def _computed(handle: Handle, known: Known, drawn: dict[str, Bundle]) -> Bundle:
-    """Result of a task; of those that it needs what is ``known``, or an image that was ``drawn`` before, is taken."""
-    if handle in known:
-        return known[handle]
-    # Images are kept: left and right of one pair, and every step of it, ask for them again.
-    spec, recorded = handle.spec, handle.spec.module.startswith("rille.datasets.")
-    if recorded and handle.label in drawn:
-        return drawn[handle.label]
-    inputs = map_ports(lambda source: _computed(source, known, drawn), handle.inputs)
-    result = known[handle] = spec.stage.run(spec.params, {**spec.args, **spec.hints}, inputs)
-    if recorded:
-        drawn[handle.label] = sound(result, handle.spec.hints.get("path", ""))
-    return result
-
-
-# -- datasets -----------------------------------------------------------------------------------------------------
-
-
-def _carried(meta: Settings, settings: Settings, images: Series[int | None] = ()) -> dict[str, str]:
-    """Attribute for the next step; ``images``: checksums of one image, or of the left and the right one."""
-    return {"rille": json.dumps({"meta": dict(meta), "settings": dict(settings), "images": images})}
-
-
-def _noted(data: Any) -> dict[str, Any]:
-    """What the step before has :func:`_carried`."""
-    try:
-        noted = json.loads(getattr(data, "attrs", {}).get("rille", "{}"))
-    except (TypeError, ValueError):  # of the user's own
-        noted = {}
-    return noted if isinstance(noted, dict) else {}
-
-
-def _settings(data: Any) -> dict[str, Any]:
-    return dict(_noted(data).get("settings", {}))
-
-
-def _merged(data: xarray.Dataset, *more: Settings) -> dict[str, Any]:
-    """Settings of the step before, and what is given now over them."""
-    settings: dict[str, Any] = {}
-    # Later layers win: settings of the sequence, settings of the step before, settings of this call.
-    for layer in (*more[:-1], _settings(data), more[-1]):
-        config.merge(settings, layer)
-    return settings
-
-
-def _bundle(
-    data: xarray.Dataset, stage: Stage, needs: Series[str], maker: str, nothing: Mapping[str, int] | None = None
-) -> Bundle:
-    """What a step before has made by ``stage``.
-
-    ``needs``: variables without which the next step cannot be; the first tells the datasets of ``stage`` from those of
-    others. ``nothing``: values of whole numbers where a mask hides them, 0 where none is named; None: the next step
-    needs none of the facts that :func:`_carried` attaches.
-    """
-    given = getattr(data, "data_vars", ())
-    bands = [array for array in stage.outputs if array.name in given]
-    lacking = [name for name in needs if name not in given]
-    lacking += [f"{b.name} ({', '.join(b.dims)})" for b in bands if data[b.name].dims != b.dims]
-    meta = _noted(data).get("meta", {})
-    if not (lacking or meta or nothing is None):
-        lacking = ["attribute rille"]
-        remedy = f"where xarray has dropped it, data.attrs = MADE.attrs, with MADE what {maker} returned, restores it"
-    else:
-        remedy = f"give what {maker} returns, whole"
-    lattice = None if lacking else lattice_of(meta)
-    # Cut, turned or thinned out, the values would be taken for those of other places.
-    places = {} if lattice is None else coordinates(lattice, "")
-    same = (name in data.coords and np.array_equal(data[name], values) for name, (values, _, _) in places.items())
-    lacking += [] if all(same) else ["x and y of all its cells, as they were"]
-    if lacking:
-        elsewhere = ELSEWHERE.get(needs[0], "")
-        raise InputError("RIL-864", f"the dataset has no {lacking[0]}", remedy=f"{remedy}{elsewhere}")
-    hidden = nothing or {}
-    return Bundle({b.name: _as_declared(b, np.asarray(data[b.name]), hidden.get(b.name, 0)) for b in bands}, meta)
-
-
-def _as_declared(about: Array, values: AnyArray, nothing: int) -> AnyArray:
-    """Values of the declared type, ``nothing`` where a mask over the whole dataset hides whole numbers by NaN."""
-    dtype = np.dtype(about.dtype)
-    if values.dtype.kind in "biuf":
-        shown = np.where(np.isnan(values), nothing, values) if dtype.kind != "f" else values
-        with np.errstate(invalid="ignore"):
-            made = shown.astype(dtype)
-        if dtype.kind == "f" or np.array_equal(made, shown):
-            return made
-    text = f"{about.name} is {values.dtype} with other values than {dtype} has"
-    remedy = f"mask it by a whole number, e.g. data.assign({about.name}=data.{about.name}.where(mask, 0))"
-    raise InputError("RIL-971", text, remedy=remedy)
-
-
-def _dataset(stage: Stage, result: Bundle, settings: Settings, images: Series[int | None] = ()) -> xarray.Dataset:
-    """Arrays with the dimensions, units and words that the stage declares, and coordinates of their lattice."""
-    import xarray
-
-    variables, lattice = {}, lattice_of(result.meta)
-    for name, values in result.arrays.items():
-        about = next(array for array in stage.outputs if array.matches(name))
-        attrs = {"units": about.unit, "long_name": about.long_name}
-        variables[name] = (about.dims, np.asarray(values), attrs)
-    on_it = lattice is not None and any(list(dims) == DIMS for dims, _, _ in variables.values())
-    places = coordinates(lattice, str(result.meta.get("frame", "local"))) if lattice is not None and on_it else {}
-    coords = {name: (dims, values, attrs) for name, (values, dims, attrs) in places.items()}
-    plain = {k: v for k, v in result.meta.items() if isinstance(v, str | int | float) and not isinstance(v, bool)}
-    return xarray.Dataset(variables, coords, {**plain, **_carried(result.meta, settings, images)})
+    return dataset_of(path_stage.path_stage, planned, settings)

@@ -17,10 +17,10 @@ from raising import raises
 from toys.browser import Browser
 
 import rille
-from rille.pipeline import api, steps
 from rille.pipeline.cli import main
 from rille.pipeline.engine import code_digest, events
 from rille.pipeline.flow import config as configuration
+from rille.pipeline.python import arguments, runs
 from rille.pipeline.runs.options import Options
 from rille.stages.core.errors import ConfigError
 
@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> rille.Run:
 
 def test_it_gives_the_digests_of_the_command_line(run: rille.Run, capsys: pytest.CaptureFixture[str]) -> None:
     folder = run.folder.parents[2]
-    given = [f"--set={word}" for word in steps.assignments({"mockup": MOCKUP, **STAGES})]
+    given = [f"--set={word}" for word in arguments.assignments({"mockup": MOCKUP, **STAGES})]
     where = ["--runs", str(folder / "again"), "--cache", str(folder / "cache"), "--executor", "inline", "--quiet"]
     with pytest.raises(SystemExit, match="0"):
         main(["reconstruct", "mockup-short", *given, *where])
@@ -55,7 +55,7 @@ def test_it_gives_the_digests_of_the_command_line(run: rille.Run, capsys: pytest
 
 
 def test_each_public_name_stands_in_the_reference() -> None:
-    reference = (Path(__file__).parents[2] / "docs/reference/api.md").read_text(encoding="utf-8")
+    reference = (Path(__file__).parents[3] / "docs/reference/api.md").read_text(encoding="utf-8")
     assert not [name for name in rille.__all__ if f":: {name}" not in reference and f"rille.{name}" not in reference]
 
 
@@ -142,7 +142,7 @@ def test_a_run_is_opened_and_shown(run: rille.Run, monkeypatch: pytest.MonkeyPat
     assert again == run
     assert rille.open_run(run.folder) == run
     shown: list[str] = []
-    monkeypatch.setattr(api.webbrowser, "open", shown.append)
+    monkeypatch.setattr(runs.webbrowser, "open", shown.append)
     again.show()
     assert shown == [(run.folder / "report.html").resolve().as_uri()]
 
@@ -199,7 +199,7 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", ["two  blanks", "a\nline", 'a "quote"', [[1, 2], [3, 4]], True, 1e-7])
 def test_settings_come_back_from_their_assignments(value: object) -> None:
-    words = steps.assignments({"section": {"key": value}})
+    words = arguments.assignments({"section": {"key": value}})
     assert "\n" not in words[0]
     assert configuration.parse_assignments(words) == {"section": {"key": value}}
 
@@ -211,14 +211,14 @@ def test_one_sequence_may_stand_for_a_list_of_one() -> None:
 
 
 def test_its_examples_run() -> None:
-    found = doctest.testmod(api)
+    found = doctest.testmod(runs)
     assert found.attempted >= 4
     assert not found.failed
 
 
 def test_no_stage_of_the_package_depends_on_it() -> None:
     assert "rille.pipeline" in (found := code_digest.module_digests("rille.pipeline.engine.plain"))
-    assert "rille.pipeline.api" not in found
+    assert "rille.pipeline.python.runs" not in found
 
 
 @pytest.mark.slow

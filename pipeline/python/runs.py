@@ -19,8 +19,9 @@ import numpy as np
 from rille.datasets.text.reading import TABLE, read_lines, read_text
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.runtime.environment import prepare_environment
+from rille.pipeline.python.arguments import Settings, assignments, place_of
+from rille.pipeline.python.sequence import StereoSequence
 from rille.pipeline.runs import lookup
-from rille.pipeline.steps import Settings, StereoSequence, assignments, place_of
 from rille.stages.core.errors import InputError, RilleError
 
 if TYPE_CHECKING:

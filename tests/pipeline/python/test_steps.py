@@ -17,10 +17,11 @@ import xarray
 from raising import raises
 
 import rille
-from rille.pipeline import steps
 from rille.pipeline.cli import main
 from rille.pipeline.engine import events
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.python import arguments, steps
+from rille.pipeline.python import sequence as sequences
 from rille.pipeline.report import summary
 from rille.pipeline.runs import run_files
 
@@ -43,10 +44,10 @@ def dem(pair: rille.StereoPair, disparity: Any) -> Any:
     return rille.terrain(disparity, pair, cell_size=0.004)
 
 
-def test_its_example_runs() -> None:
-    found = doctest.testmod(steps)
-    assert found.attempted >= 8
-    assert not found.failed
+def test_its_examples_run() -> None:
+    found = [doctest.testmod(module) for module in (steps, sequences, arguments)]
+    assert sum(each.attempted for each in found) >= 8
+    assert not any(each.failed for each in found)
 
 
 def test_a_pair_is_the_same_in_another_process(pair: rille.StereoPair) -> None:

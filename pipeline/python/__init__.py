@@ -1,0 +1,1 @@
+"""What a Python program imports as ``rille``: sequences, the steps of one pair, runs."""
