@@ -133,6 +133,8 @@ class TrajectoryFacts(Facts):
     main: int
     causes: dict[str, str]
     """Why frames, by their numbers, are lost or begin a piece, where that is known."""
+    odd_verticals: list[str]
+    """Lines, among the warnings, on pieces whose vertical is not that of the ground of most pairs."""
     excess: NotRequired[float]
     priors: NotRequired[dict[str, Any]]
 

@@ -75,12 +75,16 @@ def refuse_mirrored(rig: Rig, left: Floats, right: Floats, fitting: float) -> No
 
 def refuse_exchanged(rig: Rig, left: Floats, right: Floats) -> None:
     """Refuse matches that fit the rig with its sides exchanged, or with its transformation inverted."""
-    if fits(rig, left, right) >= 0.5:
+    as_given = fits(rig, left, right)
+    if as_given >= 0.5:
         return  # no other rig can fit twice as many
-    swapped, as_given, other_way = exchanged(rig, left, right)
-    inverted = fits(replace(rig, T_right_left=rig.T_right_left.inverse()), left, right)
-    if swapped or likelier(inverted, as_given):
-        share, how = max((other_way, "its sides exchanged"), (inverted, "its transformation inverted"))
+    inverted = replace(rig, T_right_left=rig.T_right_left.inverse())
+    others = (
+        (fits(rig, right, left), "its sides exchanged"),
+        (fits(inverted, left, right), "its transformation inverted"),
+    )
+    share, how = max(others)
+    if likelier(share, as_given):
         raise DegenerateError(
             "RIL-781",
             f"{share:.0%} of the matches fit the rig with {how}, {as_given:.0%} as given",

@@ -118,10 +118,7 @@ def level(
     samples = sampled(matches, rig, params.sigma_disparity)
     if reference is not None:
         try:
-            if not len(samples.rays):
-                remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
-                raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
-            return _on_plane(scene_plane(samples) if isinstance(reference, str) else stated_plane(reference), samples)
+            return _on_reference(reference, samples)
         except NoGroundError as error:
             facts = _facts(RigidTransform.identity(), REFERENCE_PLANE, _cell_without_ground(samples, rig))
             return {**facts, "no_ground": str(error)}
@@ -252,6 +249,13 @@ def stated_plane(reference: Sequence[float]) -> GroundPlane:
             remedy="set terrain.reference to [normal x, y, z, point x, y, z] (x right, y down, z ahead)",
         )
     return GroundPlane(math.copysign(1.0, height) * normal / length, abs(height))
+
+
+def _on_reference(reference: str | Sequence[float], samples: Samples) -> GroundFacts:
+    if not len(samples.rays):
+        remedy = "`rille check` says more of the images, and of the maps of [disparity] if there are any"
+        raise NoGroundError("RIL-385", "no pixel is matched, so no surface is seen", remedy=remedy)
+    return _on_plane(scene_plane(samples) if isinstance(reference, str) else stated_plane(reference), samples)
 
 
 def _on_plane(reference: GroundPlane, samples: Samples) -> GroundFacts:

@@ -235,13 +235,11 @@ def _bundle(
     kept, out.piece[out.piece >= 0] = np.unique(out.piece[out.piece >= 0], return_inverse=True)
     chained, causes = before.meta, {int(frame): cause for frame, cause in before.meta["causes"].items()}
     facts = account(chained["frames"], out, causes, [chained["verticals"][k] for k in kept])
-    # What the chain lacked or seemed to do is judged anew; other lines on it hold.
-    told = account(chained["frames"], Chained.of(before), causes, chained["verticals"])["warnings"]
-    others = [line for line in chained["warnings"] if line not in told]
     meta: TrajectoryFacts = {
         **chained,
         **facts,  # type: ignore[typeddict-item]
         **more,
-        "warnings": [*facts["warnings"], *others, *lines],
+        # What the chain lacked or seemed to do is judged anew.
+        "warnings": [*facts["warnings"], *chained["odd_verticals"], *lines],
     }
     return Bundle(vars(out), meta)

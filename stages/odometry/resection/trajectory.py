@@ -198,7 +198,7 @@ def _level_pieces(found: Chained, keys: Sequence[int], levels: Sequence[Bundle])
     return sources
 
 
-def _unlike_verticals(
+def _odd_verticals(
     frames: Sequence[int], found: Chained, keys: Sequence[int], levels: Sequence[Bundle]
 ) -> Iterator[str]:
     """Lines on pieces whose vertical is that of the ground of their first pair, and not that of the others' ground.
@@ -336,10 +336,12 @@ def trajectory_stage(
     found = chain(links, levels, rows, len(frames))
     verticals = _level_pieces(found, [at[0] for at in rows], inputs.levels)
     inliers = {int(f["frame"]): int(f["inliers"]) for f in facts}
+    odd = list(_odd_verticals(frames, found, [at[0] for at in rows], inputs.levels))
     meta: TrajectoryFacts = {
         "frames": frames,
         "inliers": [inliers.get(f, 0) for f in frames],
         **account(frames, found, causes, verticals),  # type: ignore[typeddict-item]
+        "odd_verticals": odd,
     }
-    meta["warnings"] += _unlike_verticals(frames, found, [at[0] for at in rows], inputs.levels)
+    meta["warnings"] += odd
     return Bundle(vars(found), meta)

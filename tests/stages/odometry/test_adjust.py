@@ -203,7 +203,7 @@ def test_factors_join_pieces_into_the_frame_of_the_first():
     truth, rng = ring(), np.random.default_rng(6)
     segments, before = run_of(truth, rng, lost={6})
     assert "broken before frame 6 (dark)" in before.meta["warnings"][0]
-    before.meta["warnings"].append("the ground bends")  # what the trajectory says of something else
+    before.meta["odd_verticals"].append("the ground bends")
     assert before.meta["pieces"] == [list(range(6)), list(range(6, 12))]
     out = adjusted(segments, before, seen(truth, 0, 11, rng), seen(truth, 1, 10, rng))
     assert out.meta["pieces"] == [list(range(12))]
