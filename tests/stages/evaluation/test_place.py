@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -66,6 +67,18 @@ def test_eastings_and_northings_lose_no_digits():
     assert np.abs(found - far - lattice(1.0)).max() < 0.005
 
 
+def test_errors_are_least_in_the_middle_of_the_matches_and_grow_with_the_distance_from_them():
+    a, b = seen(ground(1), lattice(0.01)), seen(ground(1), lattice(0.01, x=0.4, y=0.3))
+    placed = place(replace(a, matrix=a.matrix + np.array([[0, 0, 3000], [0, 0, -8000]])), b)
+    kept = np.ix_([0, 1, 5], [0, 1, 5])
+    turn = placed.pose.rotation[:2, :2]
+    sigmas = []
+    for x, y in (turn @ at for at in ((3001.5, -7998.5), (3001.5, -7898.5), (0.0, 0.0))):
+        by_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+        sigmas.append(np.sqrt(np.diag(by_pose @ placed.covariance[kept] @ by_pose.T)).max())
+    assert 0.0 < sigmas[0] < sigmas[1] / 20 < sigmas[2] / 1000
+
+
 def test_a_much_coarser_image_in_other_units_is_compared_at_its_own_cells():
     a = seen(ground(1), lattice(0.01))
     fine = seen(ground(1), lattice(0.01), cells=480).values
@@ -85,10 +98,23 @@ def test_an_image_that_fits_two_places_is_refused():
         place(a, Grid(twice, b.matrix))
 
 
+def test_an_image_that_is_distorted_by_some_cells_fits_no_second_place():
+    a = seen(ground(1), lattice(0.01))
+    y, x = np.indices(a.values.shape, np.float32)
+    for amplitude, apart in ((2.0, False), (5.0, True)):
+        waves = x + np.float32(amplitude) * np.sin(y * np.float32(2 * math.pi / 60))
+        b = Grid(cv2.remap(a.values, waves, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), a.matrix)
+        with raises("RIL-841", "two places") if apart else nullcontext():
+            place(a, b)
+
+
 def test_another_place_is_refused():
     a, b = (seen(ground(seed), lattice(0.01)) for seed in (1, 2))
     with raises("RIL-327", "one place"):
         place(a, b)
+    place(a, Grid(a.values, lattice(0.0102)))
+    with raises("RIL-327", "scale of 1.050"):
+        place(a, Grid(a.values, lattice(0.0105)))
     blank = Grid(np.full((50, 50), 90.0), lattice(0.01))
     with raises("RIL-327", "0 keypoints"):
         place(blank, b)
