@@ -89,6 +89,9 @@ def test_a_straight_line_at_constant_speed_determines_no_offset():
     assert metrics["time_offset"]["value"] == 0.0
     (warning,) = warnings
     assert "not determined" in warning
+    assert "not determined" in metrics["time_offset"]["how"]
+    _, metrics, _, _ = position_accuracy(cameras(at(MOMENTS)), truth(2, 0.7), MOMENTS)
+    assert "not determined" not in metrics["time_offset"]["how"]
 
 
 def test_rows_are_frames_where_there_are_no_times():
