@@ -23,7 +23,7 @@ from toys.finished import (
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.export.comparison import compare
-from rille.pipeline.report import figures, summary
+from rille.pipeline.report import figures, gather, summary
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams
@@ -46,6 +46,10 @@ def test_the_rig_is_shown_before_and_after(self_checked: Written) -> None:
     assert found["rig_residual_given"]["value"] == pytest.approx(0.6, abs=0.06)
     assert found["rig_residual"]["value"] == pytest.approx(0.0, abs=1e-4)
     assert found["rig_residual"]["completeness"] == "2 basic pairs, 68 matches"
+    of_matches = gather.Scene(view(bundles() | checks(), products=checked())).calibration
+    assert of_matches is not None
+    assert np.abs(of_matches.before) == pytest.approx(np.full(68, 0.7), abs=0.15)
+    assert np.abs(of_matches.after).max() < 1e-4
     assert page_.text.count("+0.5730°") >= 2
 
 
@@ -186,6 +190,15 @@ def test_a_single_pair_has_no_trajectory_and_lacks_none(tmp_path: Path) -> None:
     assert "trajectory_drift" not in facts["metrics"]
 
 
+def test_numbers_of_the_cameras_that_rest_on_the_calibration_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = {"focal length": [0.001, 0.002], "column": [0.0, 0.0013], "row": [0.0, 0.004], "toe-in": [0.0, 0.1]}
+    monkeypatch.setattr(summary, "facts_of", lambda *_: {"errors": errors, "held": ["focal length", "row", "toe-in"]})
+    (line,) = summary.resting(view())
+    assert "focal length +- 0.2 %, row +- 0.4 % of the focal length" in line
+    monkeypatch.setattr(summary, "facts_of", lambda *_: {})
+    assert summary.resting(view()) == []
+
+
 def test_residuals_of_a_part_of_the_image_are_one_median() -> None:
     points = np.array([[0.0, 0.0], [1.0, 1.0], [1.5, 0.5], [47.0, 23.0]])
     cells = figures.medians(points, np.array([1.0, 5.0, 2.0, -3.0]), (48, 24))
@@ -212,6 +225,8 @@ def test_frames_in_another_piece_are_posed_by_the_other_program_all_the_same(tmp
     assert np.isfinite(found.poses).all(axis=(1, 2)).tolist() == [True] * 3 + [False] * 3
     facts, _, _, _ = written(tmp_path, view(made, products=checked()))
     assert [m for m in facts["missing"] if "COLMAP" in m["why"] and "frame 5" in m["why"]]
+    assert "4 of 6 frames posed, 3 of them in the world," in facts["verdict"]
+    assert [row["piece"] for row in facts["frames"]] == [1, 1, 1, 2, None, None]
 
 
 @pytest.mark.parametrize(("main", "told"), [(0, 0), (1, 1)])

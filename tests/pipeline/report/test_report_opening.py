@@ -116,6 +116,12 @@ def test_failures_are_told_by_cause_with_the_tasks_that_depend_on_them():
     assert [m["why"] for m in told[:2]] == ["no ground within 36.5 m: look down", "too dark: give light"]
     facts = ("2 of 39", "locus/local", "(36, 40)", "4 tasks")
     assert [fact for fact in facts if fact not in told[0]["what"]] == []
+    (alone,) = delivery._failures(SimpleNamespace(tasks=failed("trajectory", "dark", [("merge", "trajectory")])))
+    assert alone["what"] == "trajectory failed: 1 task depends on it"
+    (one,) = delivery._failures(SimpleNamespace(tasks=[*failed("track/0", "dark"), *tasks[:1]]))
+    assert one["what"] == "track/0 failed"
+    (two,) = delivery._failures(SimpleNamespace(tasks=[*failed("locus/local/9", "dark"), *tasks[:1]]))
+    assert two["what"] == "1 of 2 tasks locus/local failed (9)"
 
 
 def test_the_plane_of_the_first_pair_that_has_one_is_told():
@@ -141,6 +147,15 @@ def test_odometry_that_says_not_how_good_it_is_could_join_pieces(priors, told):
     view = SimpleNamespace(sequence=SimpleNamespace(loose_odometry=Sequence.loose_odometry.__get__(known)))
     (item,) = delivery._poses(view, [{"frame": k, "posed": True, "in_world": k < 2} for k in range(3)])
     assert ("state drift and turn_deg of [odometry]" in item["why"]) == told
+
+
+@pytest.mark.parametrize(("tasks", "why"), [(failed("rig", "dark"), "what it needs failed"), ([], "has none")])
+def test_a_part_that_was_wanted_and_is_not_made_says_why(tasks, why):
+    tasks = [*tasks, TaskRow("image/left/0", "image", "computed")]
+    view = SimpleNamespace(tasks=tasks, until=("merge", "image"), only=("dem.tif",))
+    told = delivery._unmade(view)
+    assert [item["what"] for item in told] == ["No merge", "No dem.tif"]
+    assert all(why in item["why"] for item in told)
 
 
 @pytest.mark.parametrize("made", [True, False])
