@@ -77,14 +77,9 @@ def reconstruct(
     --------
     >>> import rille, tempfile
     >>> small = {"frames": 2, "image_width": 190, "image_height": 174, "focal_length": 200.0}
-    >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +ELLIPSIS
-    ...     run = rille.reconstruct(
-    ...         rille.open("mockup-short", mockup=small),
-    ...         runs=folder,
-    ...         cache=f"{folder}/cache",
-    ...         executor="inline",
-    ...         locus={"cell_size": 0.005},
-    ...     )
+    >>> sequence, locus = rille.open("mockup-short", mockup=small), {"cell_size": 0.005}
+    >>> with tempfile.TemporaryDirectory() as runs:  # doctest: +ELLIPSIS
+    ...     run = rille.reconstruct(sequence, runs=runs, cache=f"{runs}/cache", executor="inline", locus=locus)
     ...     again = rille.open_run(run.folder)
     ...     print(again.trajectory.sizes["frame"], again.terrain.elevation.units)
     /...computed..., cached 0, missing ...

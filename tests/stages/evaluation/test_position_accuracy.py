@@ -74,6 +74,11 @@ def test_noise_widens_the_range_of_the_offset_and_is_the_error():
     assert 0.01 < metrics["time_offset_range"]["value"] < 0.5
 
 
+def test_an_offset_of_less_than_half_a_frame_is_found():
+    _, metrics, _, _ = position_accuracy(cameras(at(MOMENTS)), truth(2, 0.03), MOMENTS)
+    assert metrics["time_offset"]["value"] == pytest.approx(0.03, abs=0.01)
+
+
 def test_an_error_of_scale_stays_an_error():
     _, metrics, _, _ = position_accuracy(cameras(1.05 * at(MOMENTS)), truth(2, 0.7), MOMENTS)
     assert metrics["position_rmse"]["value"] > 0.3
