@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from rille.pipeline.engine import memory
 from rille.pipeline.engine.graph import Graph, Handle
@@ -35,11 +35,20 @@ class Tiling(Params):
     ----------
     memory : memory [MB] that one task of the matcher may take besides the program itself (about 300); larger pairs are
         matched in tiles.
-    tile : side of a tile [pixels] at every level; 0: pairs of any size are matched whole; not set: chosen by memory.
+    tile : side of a tile [pixels] at every level, at least 64; 0: pairs of any size are matched whole; not set: chosen
+        by memory.
     """
 
     memory: int = Field(1000, ge=50)
     tile: int | None = Field(None, ge=0)
+
+    @field_validator("tile")
+    @classmethod
+    def _no_mere_surroundings(cls, side: int | None) -> int | None:
+        # Each tile is matched with surroundings of some hundred pixels.
+        if side is not None and 0 < side < 64:
+            raise ValueError("0, or at least 64")
+        return side
 
 
 def side(tiling: Tiling, params: HfvmParams, pyramid: PyramidParams, shapes: tuple[Shape, Shape]) -> int | None:

@@ -5,6 +5,7 @@ import hashlib
 import cv2
 import numpy as np
 import pytest
+from raising import raises
 
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
@@ -107,3 +108,6 @@ def test_a_pair_is_whole_where_an_image_lacks_the_level_that_tiles_start_from():
 
 def test_tiling_is_a_section_of_the_configuration():
     assert build({"tiling": {"tile": 256}}).tiling == Tiling(tile=256)
+    assert build({"tiling": {"tile": 0}}).tiling.tile == 0
+    with raises("RIL-027", "tiling.tile = 5 is not permitted: 0, or at least 64"):
+        build({"tiling": {"tile": 5}})
