@@ -287,6 +287,16 @@ def test_degrees_of_latitude_are_named():
     assert "leaves" not in departure(own, -own + 0.4 * np.roll(own, 1, axis=0), 0.1, "ways")[1]
 
 
+def test_a_turn_a_scale_or_both_are_named():
+    own = np.random.default_rng(1).normal(size=(9, 3))
+    turned = own @ rotation_exp([0.0, 0.3, 0.0])  # 17.2 degrees
+    words = "is turned by 16.", "have to be multiplied by 0.5,"
+    for said, told in ((turned, words[:1]), (2.0 * own, words[1:]), (2.0 * turned, words)):
+        off, how = departure(own, said, 0.1, "ways")
+        assert off > 0.1
+        assert [word in how for word in words] == [word in told for word in words]
+
+
 def test_too_few_positions_contradict_nothing():
     truth, rng = winding(), np.random.default_rng(4)
     segments, before = run_of(truth, rng)
