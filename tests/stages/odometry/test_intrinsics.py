@@ -10,6 +10,7 @@ import pytest
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
+from rille.stages.odometry.resection import calibration_errors
 from rille.stages.odometry.resection.bundle_adjustment import (
     SegmentAdjustment,
     SegmentState,
@@ -384,3 +385,24 @@ def test_a_camera_at_rest_tells_no_time_between_its_rows():
     state = state._replace(R=np.array([at.rotation] * 2), t=np.array([at.translation] * 2))
     part = contribution(SegmentAdjustment(replace(tracks, pixels=np.array([here, here])), PARAMS), state, cameras)
     assert part.read_out == pytest.approx((0.0, 0.0), abs=1.0)  # standard deviation of an interval at least
+
+
+def test_the_time_between_the_rows_is_found_beside_poses_bias_and_errors_of_a_usual_calibration():
+    rng, bias, prior = np.random.default_rng(5), 0.3, 1e11
+    at = 6  # the bias, behind the poses; then the errors, and the time
+    truth = np.concatenate([rng.normal(size=at + 1), np.zeros(len(calibration_errors.PRIORS)), [0.7]])
+    design = 1e4 * rng.normal(size=(80, len(truth)))
+
+    def found(design):
+        matrix, right = design.T @ design, design.T @ design @ truth
+        matrix[at, at] += prior
+        right[at] -= prior * bias  # which draws the bias to zero
+        return calibration_errors._of_read_out(matrix, right, prior, bias)
+
+    information, pull = found(design)
+    assert pull / information == pytest.approx(0.7, abs=1e-4)
+    # The focal length, known to half a per cent, does the same to the images as the time.
+    design[:, at + 1] = design[:, -1]
+    information, pull = found(design)
+    assert information == pytest.approx(0.005**-2.0, rel=1e-3)
+    assert pull / information == pytest.approx(0.7, abs=1e-3)
