@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import interpolate, ndimage
 
-from rille.stages.geometry.spline import TAPS_RADIUS_PX, coefficients, slopes, weights
+from rille.stages.geometry.spline import TAPS_RADIUS_PX, coefficients, slopes, value_and_gradient, weights
 
 
 @pytest.mark.parametrize("shape", [(40, 50), (3, 60), (1, 7)])
@@ -32,3 +32,14 @@ def test_weights_and_slopes_are_those_of_the_basis(t):
     at = t - np.arange(-1, 3)
     np.testing.assert_allclose(weights(np.float32(t)), np.nan_to_num(basis(at)), atol=1e-6)
     np.testing.assert_allclose(slopes(np.float32(t)), np.nan_to_num(basis.derivative()(at)), atol=1e-6)
+
+
+def test_value_and_gradient_are_those_of_scipy():
+    rng = np.random.default_rng(2)
+    image = rng.uniform(0, 255, (40, 50)).astype(np.float32)
+    spline, exact = coefficients(image), interpolate.RectBivariateSpline(np.arange(40), np.arange(50), image, s=0)
+    for x, y in rng.uniform(12, 27, (20, 2)).astype(np.float32):
+        found = value_and_gradient(spline, x, y)
+        wanted = [exact(y, x, dx=dy, dy=dx)[0, 0] for dx, dy in ((0, 0), (1, 0), (0, 1))]
+        # SciPy's ends are others, which shows by the pole, .268, to the power of the distance.
+        np.testing.assert_allclose(found, wanted, atol=0.02)

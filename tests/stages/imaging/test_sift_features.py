@@ -57,6 +57,14 @@ def test_features_keep_away_from_what_is_masked() -> None:
     assert len(extract(dark, np.zeros_like(valid))["points"]) == 0
 
 
+def test_the_first_pixel_of_matched_points_is_at_zero() -> None:
+    a = everywhere(SMALL)
+    left, right = features.matched_points(a, everywhere(np.roll(SMALL, 7, axis=1)))
+    assert np.median(right - left, axis=0) == pytest.approx([7.0, 0.0], abs=0.01)
+    places = {tuple(point) for point in np.round(np.asarray(a["points"], np.float64) - 0.5, 3)}
+    assert {tuple(point) for point in np.round(left, 3)} <= places
+
+
 @pytest.mark.parametrize("size", [1, 2, 8])
 def test_the_first_pixel_s_centre_is_at_one_half(size: int) -> None:
     """A blob about pixel (row 60, column 100), in images that are doubled, halved, and reduced and halved."""
