@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,10 @@ from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import Search, nearest_hint, read_bytes
+from rille.datasets.text.reading import Search, nearest_hint
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import IncompleteError, InputError, within
+from rille.stages.core.errors import IncompleteError, InputError, warning, within
+from rille.stages.core.quantities import count
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -59,14 +60,8 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
 
 def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequence:
     base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
-    if manifest.disparity is not None:
-        note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
-        base = replace(base, disparity=disparity, notes=(*base.notes, note))
-    if manifest.truth_disparity is not None:
-        exact = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
-        note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
-        base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
+    for key, stated in (("disparity", manifest.disparity), ("truth_disparity", manifest.truth_disparity)):
+        base = _with_maps(key, stated, root, base, pairs, digests)
     sequence = MotionReader(root, pairs, base, digests.growing, manifest.world.crs or "").read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     return replace(
@@ -126,39 +121,53 @@ def _of_bag(manifest: Manifest, root: Path) -> tuple[Sequence, tuple[ImagePair, 
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
 
-def _disparity(
+def _with_maps(
     key: str,
-    stated: DisparityMaps,
+    stated: DisparityMaps | None,
     root: Path,
     sequence: Sequence,
     pairs: tuple[ImagePair, ...],
     digests: files.Digests,
-) -> Callable[[int], Source]:
-    """Function that returns the source of another program's, or of the true disparity of a frame; ``key``: name of the
-    table."""
+) -> Sequence:
+    """The sequence with another program's, or with true disparities; ``key``: name of the table, and of the attribute.
+
+    A pair without a map of another program is lost; one without a true map is not judged.
+    """
+    if stated is None:
+        return sequence
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
     frames = [k for k, pair in enumerate(pairs) if not pair.absent]
     lefts = [pairs[k].left for k in frames]
-    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{key}.left")}
-    claimed = stated.sigma if isinstance(stated, Disparity) else None
-    sigma = claimed if isinstance(claimed, float) else None
-    if isinstance(claimed, str):
-        maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
-    common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
-    for first, *_ in maps.values():
-        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # raises errors early
+    claimed = stated.sigma if isinstance(stated, Disparity) else None
+    patterns = {"column_disparity": stated.left} | ({"disparity_std": claimed} if isinstance(claimed, str) else {})
+    maps, absent = dict[str, dict[int, Path]](), dict[int, str]()
+    for (array, pattern), name in zip(patterns.items(), ("left", "sigma"), strict=False):
+        found, why = disparities.find(pattern, root, lefts, size, f"{key}.{name}")
+        maps[array] = dict(zip(frames, found, strict=True))
+        absent |= {frame: words for frame, words in zip(frames, why, strict=True) if words and frame not in absent}
+    common = {"size": list(size), "sign": stated.sign, "sigma": None if isinstance(claimed, str) else claimed}
 
     def source(frame: int) -> Source:
-        paths = {array: of[frames.index(frame)] for array, of in maps.items()}
+        paths = {array: by_frame[frame] for array, by_frame in maps.items()}
         args = {**common, "frame": frame, "digests": {array: digests.sha256(path) for array, path in paths.items()}}
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
-    return source
+    if key == "disparity":
+        note = f"disparities are those of {stated.left}, made by another program, and checked"
+        return replace(sequence, disparity=source, lost={**sequence.lost, **absent}, notes=(*sequence.notes, note))
+    note = f"true disparities are those of {stated.left}; they only judge"
+    there = f"{count(len(absent), 'pair')} without a true disparity ({next(iter(absent.values()), '')})"
+    return replace(
+        sequence,
+        truth_disparity=lambda frame: None if frame in absent else source(frame),
+        notes=(*sequence.notes, note),
+        warnings=(*sequence.warnings, *([warning("RIL-686", there)] if absent else [])),
+    )
 
 
 def default_name(path: Path) -> str:
