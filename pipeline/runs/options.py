@@ -62,9 +62,9 @@ class Settings:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Work(Settings):
-    """:class:`Settings`, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
+    """:class:`Settings`, and options that choose the part that is made, and where tasks run.
 
-    With ``runs``, so that a plan takes the command line of its run.
+    ``executor`` may also be a ``Client`` of dask. With ``runs``, so that a plan takes the command line of its run.
 
     Parameters
     ----------
@@ -76,6 +76,10 @@ class Work(Settings):
         Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port.
     memory_limit
         Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free.
+    until
+        Compute a stage's tasks and what they need, nothing else; may be repeated.
+    only
+        Make a file, for example dem.tif, and what it needs, nothing else; may be repeated.
     """
 
     jobs: int | None = None
@@ -83,21 +87,23 @@ class Work(Settings):
     executor: Any = "dask"
     memory_limit: str | None = None
     runs: Runs = RUNS
+    until: Annotated[tuple[str, ...], SEVERAL] = ()
+    only: Annotated[tuple[str, ...], SEVERAL] = ()
+
+    def part(self) -> str:
+        """The options that choose a part of the run, as typed; empty: all of it."""
+        return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Options(Work):
-    """:class:`Work`, and options of the part that is made and of the messages during a run.
+    """:class:`Work`, and options of failures and of the messages during a run.
 
     Parameters
     ----------
     keep_going
         After a failure, finish all tasks that do not depend on it; the exit status is then 3.
-    until
-        Compute a stage's tasks and what they need, nothing else; may be repeated.
-    only
-        Make a file, for example dem.tif, and what it needs, nothing else; may be repeated.
     progress
         How progress is shown on stderr.
     quiet
@@ -105,14 +111,8 @@ class Options(Work):
     """
 
     keep_going: Annotated[bool, FLAG] = False
-    until: Annotated[tuple[str, ...], SEVERAL] = ()
-    only: Annotated[tuple[str, ...], SEVERAL] = ()
     progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
     quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
-
-    def part(self) -> str:
-        """The options that choose a part of the run, as typed; empty: all of it."""
-        return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
 
     def command(self, verb: str, *opened: str) -> str:
         """The command line, for a shell, that repeats a run of a sequence (``Sequence.opened``), in one line."""

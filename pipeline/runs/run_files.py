@@ -58,9 +58,10 @@ def _is_wanted(output: Output, view: RunView, graph: Graph) -> bool:
 
 def plan(graph: Graph, view: RunView) -> None:
     """Add the task of each output that a run would make; ``view`` is known without a computation."""
-    for module in MODULES:
+    for module in MODULES if graph.cut is None else catalogue.MADE:
         for output in module.OUTPUTS:
-            add(graph, module, output, view)
+            if graph.cut is None or _is_wanted(output, view, graph):
+                add(graph, module, output, view)
 
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:

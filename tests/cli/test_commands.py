@@ -189,6 +189,18 @@ def test_plan_of_what_is_there_finds_nothing_to_do(place: Place, words: list[str
     assert first.last == f"{ran[1]} tasks known: {ran[1]} cached, 0 to do", "outputs are tasks too"
 
 
+@pytest.mark.parametrize("part", [["--until", "merge"], ["--only", "dem.tif", "--only", "path.gpkg"]])
+def test_plan_of_a_part_knows_its_tasks_alone(place: Place, part: list[str]) -> None:
+    whole, done = place.here("plan", *MOCKUP), place.here("plan", *MOCKUP, *part)
+    assert (done.status, done.err) == (0, "")
+    tasks = re.fullmatch(r"(\d+) tasks known: \1 cached, 0 to do", done.last)
+    assert tasks is not None, done.last
+    assert int(tasks[1]) < int(whole.last.split()[0])
+    anew = place.here("plan", *MOCKUP, *part, "--set", "hfvm.preset=fast")
+    assert "accuracy" not in anew.out
+    assert place.here("plan", *MOCKUP, "--until", "merges").status == 2
+
+
 @pytest.mark.parametrize(
     ("words", "cached"),
     [

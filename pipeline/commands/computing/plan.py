@@ -25,7 +25,7 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.view import RunView
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
-from rille.pipeline.runs import run_files
+from rille.pipeline.runs import part_of_run, run_files
 from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
@@ -49,18 +49,20 @@ def plan(
     """
     seq, options, _ = resolved(seq, options)
     settled = settings_of_run(seq, options)
-    graph, store, config = Graph(), Store(cache_folder(options.cache)), settled.config
+    graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
+    config = settled.config
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
         if not graph.waiting:  # else some inputs are unknown, so they belong to the unknown tasks
-            run_files.plan(graph, late(RunView(**vars(settled), products=products), drive))
+            view = RunView(**vars(settled), products=products, until=options.until, only=options.only)
+            run_files.plan(graph, late(view, drive))
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))
     result.check()
-    # Unknown tasks may read a parameter.
-    if not result.unknown and (lost := unread.unread(settled.given, config, graph)):
+    # Unknown tasks, and those of other parts, may read a parameter.
+    if not (result.unknown or options.part()) and (lost := unread.unread(settled.given, config, graph)):
         raise unread.error(lost, config)
     budget = memory.budget(options.executor, memory_limit(options), options.jobs)
     planned = memory.Estimates().planned(graph)
