@@ -275,7 +275,9 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
     if blocking < far:
         # Rows cross the map: the target lies aside of what they reach, or the map is shorter than the vehicle.
         reason = AHEAD if target is None else JOINED
-    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, blocking if blocking >= far else None)
+    # In any direction no row closes the way.
+    row = blocking if blocking >= far and params.planner != "grid8" else None
+    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, row)
 
 
 def _by_rows(ground: PathMaps, ends: Cells, slack: int, params: PathParams) -> Iterator[tuple[str, Ints, int]]:
