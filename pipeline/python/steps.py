@@ -241,7 +241,8 @@ def terrain(
         Of :func:`match`, of this pair; pixels that :meth:`xarray.Dataset.where` masks count as unmatched. Enough are
         ``column_disparity`` and ``row_disparity`` (row, col), right minus left, px, NaN unknown: without ``validity``
         all known pixels count as matched, without ``disparity_std`` their standard deviation is
-        ``locus.sigma_disparity``.
+        ``locus.sigma_disparity``. Settings of :func:`match` hold for the right image, too, which is matched here;
+        without the attribute ``rille``, which xarray may drop, those of the sequence do.
     pair
         The pair.
     reference
