@@ -199,11 +199,13 @@ def test_a_reader_that_has_gone_is_no_traceback() -> None:
 def test_names_with_any_letters_in_an_ascii_locale(tmp_path: Path) -> None:
     (tmp_path / "größe").mkdir()
     locale = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
-    words = [str(RILLE), "datasets", "export", "mockup-short", "größe/ü", "--set", "mockup.frames=1"]
-    subprocess.run(words, check=True, cwd=tmp_path, env=locale, capture_output=True)
-    done = subprocess.run([str(RILLE), "init", "größe/ü", "--force"], check=True, cwd=tmp_path, env=locale, capture_output=True)
-    assert "rille check größe/ü.rille.toml" in done.stdout.decode().replace("'", "")
-    assert 'root = "ü"' in (tmp_path / "größe" / "ü.rille.toml").read_text("utf-8")
+    for words in (
+        ["datasets", "export", "mockup-short", "größe/ü", "--set", "mockup.frames=1"],
+        ["init", "größe/ü", "--output", "größe/ö.toml"],
+    ):
+        done = subprocess.run([str(RILLE), *words], check=True, cwd=tmp_path, env=locale, capture_output=True)
+    assert "rille check 'größe/ö.toml'" in done.stdout.decode()
+    assert 'root = "ü"' in (tmp_path / "größe" / "ö.toml").read_text("utf-8")
 
 
 def test_closed_streams_lead_nowhere() -> None:
