@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator
@@ -14,8 +15,9 @@ from pathlib import Path
 from rille.datasets.images import pairing
 from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import split
+from rille.datasets.images.kinds import line, split
 from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
+from rille.datasets.text.names import shell_word
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import Sizes
@@ -137,7 +139,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         both, parts, counts = _sets(folder, images)
     if parts:
         first, second = parts
-        both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
+        both, tokens = _by_place(folder, parts), ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
@@ -153,7 +155,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
+    others = _of_other_sets(folder, key, both)
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [relative(path, folder) for path in photographs if path not in paired]
     if computed := [relative(path, folder) for path in images if path not in set(photographs)]:
@@ -174,6 +176,31 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         tuple(lines),
         (*others, *([f"{count(len(alone), 'image')} ({alone[0]} ...): of neither camera by name"] if alone else ())),
     )
+
+
+def _by_place(folder: Path, parts: dict[str, list[Path]]) -> Sets:
+    """Images by camera, a set for each folder without the words of cameras, unless each has one frame, or one side."""
+    places: Sets = defaultdict(lambda: ([], []))
+    for side, images in enumerate(parts.values()):
+        for path in images:
+            words = re.split(r"([^\W_]+)", relative(path.parent, folder))
+            places[0, "".join("*" if word in parts else word for word in words)][side].append(path)
+    left, right = parts.values()
+    apart = all(map(all, places.values())) and any(min(map(len, of)) > 1 for of in places.values())
+    return places if apart else {(0, ""): (left, right)}
+
+
+def _of_other_sets(folder: Path, chosen: tuple[int, str], both: Sets) -> list[str]:
+    """A line on the sets that are not chosen, with the command for one of them where it has a folder of its own."""
+    tops = {at: Path(os.path.commonpath([path.parent for path in (*of[0], *of[1])])) for at, of in both.items()}
+    taken, apart = tops.pop(chosen), list[str]()
+    for at, top in tops.items():
+        own = not any(top == other or top in other.parents for other in (folder, taken))
+        apart.append(relative(top, folder) if own else f"{pattern(both[at][0], folder)} and its right images")
+    remedy = "a manifest opens one of them: state its images.left and images.right"
+    if apart and (folder / apart[0]).is_dir():
+        remedy = f"each is a sequence of its own: `rille init {shell_word(folder / apart[0])}`"
+    return [line("other set", apart, remedy)] if apart else []
 
 
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:

@@ -375,6 +375,26 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     assert "left/3.jpg" in told
 
 
+@pytest.mark.parametrize(
+    ("template", "sides", "frames", "command"),
+    [
+        ("{scene}/{side}{name}.png", ("im0_", "im1_"), "12", "rille init {folder}/bridge"),
+        ("{scene}/im{side}.png", "01", "1", "rille init {folder}/bridge"),  # ETH3D
+        ("{scene}/camera_{side}/im{name}.png", ("00", "02"), "012", "rille init {folder}/bridge"),  # Booster
+        ("{side}-half/{scene}/{name}.png", ("left", "right"), "123", "images.left and images.right"),  # DrivingStereo
+    ],
+)
+def test_of_several_scenes_one_is_taken_and_a_command_opens_another(tmp_path, template, sides, frames, command):
+    every = [(scene, side, name) for scene in ("bridge", "cellar", "alley") for side in sides for name in frames]
+    write_images(tmp_path, [template.format(scene=scene, side=side, name=name) for scene, side, name in every])
+    found = inspect(tmp_path)
+    assert (found.views.pairs, found.views.trouble) == (len(frames), "")
+    assert "alley" in found.views.left
+    assert any("2 other sets (" in line and command.format(folder=tmp_path) in line for line in found.unread), (
+        found.unread
+    )
+
+
 def test_places_in_images_become_a_table(tmp_path):
     from PIL import Image
 
@@ -399,7 +419,7 @@ def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     write_images(tmp_path, days)
     found = inspect(tmp_path)
     assert (found.views.left, found.views.right, found.views.pairs) == ("day1_left_*.png", "day1_right_*.png", 3)
-    assert any(line.startswith("day2_left_*.png and its right images") for line in found.unread)
+    assert any("(day2_left_*.png and its right images)" in line for line in found.unread)
 
 
 @pytest.mark.parametrize("name", ["my.rille.toml", "my.toml"])
