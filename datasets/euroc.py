@@ -67,14 +67,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         imu=imu,
         defaults={"locus.cell_size": 0.05},
     )
-    try:
-        sequence = open_described(manifest, folder, str(folder), digests)
-    except InputError as error:
-        spare = next((name for name in (*TRUTH, IMU) if f"{name}/" in error.message), None)
-        if spare is None:
-            raise
-        remedy = f"{error.remedy}; or rename {folder / spare}: the folder opens without it"
-        raise type(error)(error.code, error.message, remedy=remedy) from error
+    sequence = open_described(manifest, folder, str(folder), digests, [folder / name for name in (*TRUTH, IMU)])
     return replace(sequence, warnings=(*sequence.warnings, *warnings))
 
 

@@ -66,7 +66,9 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         text = f"{path} has image folders {' and '.join(sides)}, but no calib.txt"
         remedy = f"`rille init {shell_word(path)}` writes a manifest that says what is needed"
         raise InputError("RIL-278", text, remedy=remedy)
-    sequence = open_described(manifest_of(folder, sides), folder, str(folder), digests)
+    manifest = manifest_of(folder, sides)
+    spare = [folder / of.file for of in (manifest.truth, manifest.times) if of is not None and of.file]
+    sequence = open_described(manifest, folder, str(folder), digests, spare)
     return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
 
 

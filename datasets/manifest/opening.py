@@ -46,16 +46,27 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     return open_described(named, root_folder(manifest.root, path), str(path), digests)
 
 
-def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
+def open_described(
+    manifest: Manifest, root: Path, name: str, digests: files.Digests, spare: Iterable[Path] = ()
+) -> Sequence:
     """The sequence of a manifest, which comes from a file or from the reader of a folder layout.
 
     Parameters
     ----------
     root : folder that the files are relative to.
     name : the manifest's or the folder's, for errors.
+    spare : files and folders without which the folder opens, too.
     """
-    with within(name):
-        return _described(manifest, root, digests)
+    try:
+        with within(name):
+            return _described(manifest, root, digests)
+    except InputError as error:
+        named = (path for path in spare if re.search(rf"(?<![\w.-]){re.escape(path.name)}(?![\w-])", error.message))
+        needless = next(filter(Path.exists, named), None)
+        if needless is None:
+            raise
+        remedy = f"{error.remedy}; or rename {needless}: the folder opens without it"
+        raise type(error)(error.code, error.message, remedy=remedy) from error
 
 
 def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequence:

@@ -180,8 +180,8 @@ def _empty(f):
     [
         breaks(("right missing", _drop_right, ("RIL-259", "000001.png"))),
         breaks(("left missing", _drop_left, ("RIL-259", "image_r/000001.png"))),
-        breaks(("pose count", _fewer_poses, ("RIL-230", "poses.txt"))),
-        breaks(("time count", _times, ("RIL-229", "times.txt"))),
+        breaks(("pose count", _fewer_poses, ("RIL-230", "or rename {}/poses.txt: the folder opens without it"))),
+        breaks(("time count", _times, ("RIL-229", "or rename {}/times.txt"))),
         breaks(("no calibration", _no_calib, ("RIL-278", "calib.txt"))),
         breaks(("one camera", _one_row, ("RIL-100", "calib.txt"))),
         breaks(("short row", _short_row, ("RIL-100", "calib.txt"))),
@@ -193,7 +193,7 @@ def _empty(f):
 )
 def test_what_is_wrong_is_one_line_with_a_remedy(folder, spoil, expected):
     spoil(folder)
-    with raises(*expected) as caught:
+    with raises(*(words.format(folder) for words in expected)) as caught:
         open_sequence(str(folder))
     assert "\n" not in str(caught.value)
     assert caught.value.remedy
