@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -25,10 +25,11 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
-    "camodocal, VINS, Basalt, mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, "
-    "Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) are read; "
-    "of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
-    "transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
+    "camodocal, VINS, Basalt, mrcal, DSO, MRPT, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
+    "COLMAP, Middlebury calib.txt, KITTI, DSEC, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, "
+    "CAHVORE) are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; "
+    "MATLAB's K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of "
+    "view / 2)"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -46,6 +47,8 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
+    (lambda text: f"_{makers.OF_RIGHT}]" in text, makers.mrpt),
+    (lambda text: slam.DSO.search(text) is not None, slam.dso),
     (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
@@ -56,6 +59,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
+    (lambda f: isinstance(of := f.values.get("extrinsics"), Mapping) and "T_10" in of, slam.dsec),
     (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),

@@ -282,6 +282,15 @@ class Fields:
             raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number below {GREATEST:g}")
         return number
 
+    def quaternion(self, key: str, xyzw: Sequence[float]) -> Floats:
+        """Rotation matrix of the unit quaternion at ``key``, its scalar last."""
+        from scipy.spatial.transform import Rotation
+
+        length = float(np.linalg.norm(xyzw))
+        if abs(length - 1) > 0.01:
+            raise self.error("RIL-767", key, f"is a quaternion of length {length:.4g}, it should be 1")
+        return np.asarray(Rotation.from_quat(xyzw).as_matrix(), np.float64)
+
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
         """Rigid transform of the numbers at ``key``."""
         with self._within(key):

@@ -1,7 +1,7 @@
 """Calibrations of stereo cameras and data sets by their makers.
 
-ZED's ``.conf``, OAK's JSON (DepthAI), RealSense's list, ``K.txt``, Middlebury's rectified pairs (2014 and 2021), and
-figures by key.
+ZED's ``.conf``, MRPT's ``.ini`` (Malaga), OAK's JSON (DepthAI), RealSense's list, ``K.txt``, Middlebury's rectified
+pairs (2014 and 2021), and figures by key.
 """
 
 from __future__ import annotations
@@ -24,9 +24,34 @@ from rille.datasets.text.units import METRIC, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]([^\[]*)", re.MULTILINE)
-ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
-"""Of a ``.conf``: a section with its text, and one of its entries."""
+SIDES = ("LEFT", "RIGHT")
+
+SECTION = re.compile(r"^[ \t]*\[(\w{1,60})\].*$", re.MULTILINE)
+ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\[[^\]\n]*\]|\S+)", re.MULTILINE)
+"""Of a ``.conf`` or ``.ini``: the head of a section, and one of its entries, a word or a list in brackets."""
+
+
+class _Sections(dict[str, Fields]):
+    """Entries of each section by its name in capitals, by keys in small letters; none of one that is not there."""
+
+    def __missing__(self, name: str) -> Fields:
+        return Fields({}, next(iter(self.values())).file, f"{name} ")
+
+
+def _sections(text: str, path: Path) -> _Sections:
+    _, *parts = SECTION.split(text)
+    named = zip(parts[::2], map(ENTRY.findall, parts[1::2]), strict=True)
+    found = {name.upper(): entries(((k.lower(), v) for k, v in rows), f"{path} {name}") for name, rows in named}
+    return _Sections({name: Fields(_listed(values), str(path), f"{name} ") for name, values in found.items()})
+
+
+def _listed(values: Mapping[str, str]) -> dict[str, str | list[str]]:
+    """Entries with a list of words for a text in brackets, as of MATLAB."""
+    return {
+        key: value.strip("[]").replace(";", " ").split() if value.startswith("[") else value
+        for key, value in values.items()
+    }
+
 
 ZED_SIZES = {
     "VGA": (672, 376),
@@ -48,20 +73,13 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). With several resolutions each has its size;
     the size of a single one is that of the images.
     """
-    parts = {
-        name.upper(): entries(((k.lower(), v) for k, v in ENTRY.findall(body)), f"{path} {name}")
-        for name, body in SECTION.findall(text)
-    }
+    parts = _sections(text, path)
     names = [name.removeprefix("LEFT_CAM_") for name in parts if name.startswith("LEFT_CAM_")]
-    stereo = Fields(parts.get("STEREO", {}), str(path), "STEREO ")
+    stereo = parts["STEREO"]
     cameras = []
     for name in names:
         size = ZED_SIZES.get(name, UNKNOWN_SIZE) if len(names) > 1 else UNKNOWN_SIZE
-        # Newer files have one distortion for all resolutions.
-        left, right = (
-            _zed_lens(Fields(parts.get(f"{side}_DISTO", {}) | parts.get(at, {}), str(path), f"{at} "), size)
-            for side, at in (("LEFT", f"LEFT_CAM_{name}"), ("RIGHT", f"RIGHT_CAM_{name}"))
-        )
+        left, right = (_zed_lens(parts[f"{side}_CAM_{name}"], parts[f"{side}_DISTO"], size) for side in SIDES)
         rx, cv, rz, ty, tz = (
             stereo.number(f"{key}_{name.lower()}", stereo.number(key, 0.0)) for key in ("rx", "cv", "rz", "ty", "tz")
         )
@@ -71,10 +89,30 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     return cameras
 
 
-def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
+def _zed_lens(camera: Fields, distortion: Fields, size: tuple[int, int]) -> Lens:
+    # Newer files have one distortion for all resolutions.
+    f = Fields({**distortion.values, **camera.values}, camera.file, camera.at)
     lens = f.optics("fx fy cx cy", size, "fisheye" if "k4" in f and "p1" not in f else "rational")
     f.check_lens()
     return lens
+
+
+OF_RIGHT = "LEFT2RIGHT_POSE"
+"""End of the name of MRPT's section with the pose of the right camera in the left one's frame."""
+
+
+def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of MRPT's stereo calibration (Malaga's data sets); lengths are metres."""
+    parts = _sections(text, path)
+    prefix = next(name for name in parts if name.endswith(OF_RIGHT)).removesuffix(OF_RIGHT)
+    placed, of_sides = parts[prefix + OF_RIGHT], [parts[prefix + side] for side in SIDES]
+    cameras = (f.optics("fx fy cx cy", f.size("resolution"), "none").camera for f in of_sides)
+    left, right = [f.distorted("dist", camera) for f, camera in zip(of_sides, cameras, strict=True)]
+    for f in of_sides:
+        f.check_lens()
+    x, y, z, qw, qx, qy, qz = placed.numbers("pose_quaternion", 7)
+    T_left_right = RigidTransform(placed.quaternion("pose_quaternion", (qx, qy, qz, qw)), np.array([x, y, z]))
+    return stereo_cameras(left, right, T_left_right.inverse())
 
 
 def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -219,9 +257,7 @@ def beside(f: Fields) -> RigidTransform | None:
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here in metres."""
-    values = entries((line for line in assignments(text) if line[0]), str(path))
-    rows = {key: value.strip("[]").replace(";", " ").split() for key, value in values.items() if value.startswith("[")}
-    f = Fields(values | rows, str(path))
+    f = Fields(_listed(entries((line for line in assignments(text) if line[0]), str(path))), str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

@@ -1,4 +1,5 @@
-"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt and mrcal."""
+"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, mrcal, DSO,
+and of data sets: DSEC, 4Seasons, VBR, OpenLORIS."""
 
 from __future__ import annotations
 
@@ -9,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields, by_count, flattened
+from rille.datasets.cameras.fields import MODELS, Fields, by_count, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.images.pairing import natural
+from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C")
-"""Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS."""
+BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C", "T_b")
+"""Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS, VBR."""
 
 BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
 """Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
@@ -57,10 +59,7 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     for part, T in zip(parts, poses, strict=True):
         if T is None:
             part.check_turn()
-    return [
-        CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)
-        for name, part, T in zip(names, parts, poses, strict=True)
-    ]
+    return [CalibratedCamera(name, _pinhole_lens(part), T) for name, part, T in zip(names, parts, poses, strict=True)]
 
 
 def _of_body(part: Fields) -> RigidTransform | None:
@@ -100,8 +99,6 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of Basalt's JSON: ``T_imu_cam`` maps each camera to the IMU by a quaternion, metres."""
-    from scipy.spatial.transform import Rotation
-
     f = f.sub("value0")
     cameras, poses, sizes = (
         Fields(dict(enumerate(f.get(key))), f.file, f"{f.at}{key}.", f.used)
@@ -110,15 +107,50 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
     found = []
     for k in cameras.values:
         camera, pose = cameras.sub(k), poses.sub(k)
-        kind, q = camera.text("camera_type"), np.array([pose.number(f"q{axis}") for axis in "xyzw"])
+        kind, q = camera.text("camera_type"), [pose.number(f"q{axis}") for axis in "xyzw"]
         if kind not in BASALT:
             raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
-        if abs(np.linalg.norm(q) - 1) > 0.01:
-            raise pose.error("RIL-767", "qx, qy, qz, qw", f"have length {np.linalg.norm(q):.4g}, it should be 1")
         lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.size(k), BASALT[kind])
-        T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
-        found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
+        R, t = pose.quaternion("qx, qy, qz, qw", q), np.array([pose.number(f"p{axis}") for axis in "xyz"])
+        found.append(CalibratedCamera(f"cam{k}", lens, RigidTransform(R, t).inverse()))
     return found
+
+
+def dsec(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of DSEC: ``T_10`` maps camera 0 to camera 1, ``R_rect0`` camera 0 to its rectified one, ``camRect0``."""
+    optics, placed = f.sub("intrinsics"), f.sub("extrinsics")
+    T, found = RigidTransform.identity(), list[CalibratedCamera]()
+    for k, name in enumerate(sorted(key for key in optics.values if re.fullmatch(r"cam\d", key))):
+        T = placed.pose(f"T_{k}{k - 1}") @ T if k else T
+        camera = CalibratedCamera(name, _pinhole_lens(optics.sub(name)), T)
+        if f"camRect{k}" in optics:
+            turned = placed.rigid(f"R_rect{k}", placed.matrix(f"R_rect{k}", 3, 3), np.zeros(3)) @ T
+            ideal = CalibratedCamera(f"camRect{k}", _pinhole_lens(optics.sub(f"camRect{k}")), turned)
+            camera = replace(camera, rectified=ideal)
+        found.append(camera)
+    return found
+
+
+DSO = re.compile(
+    r"^(Pinhole|RadTan|EquiDistant|KannalaBrandt)((?:[ \t]+[-+.\deE]{1,40}){5,8})\s*^(\d+)[ \t]+(\d+)", re.M
+)
+"""Beginning of a calibration of DSO and 4Seasons: model with fx, fy, cx, cy and coefficients; width and height."""
+
+
+def dso(text: str, path: Path) -> list[CalibratedCamera]:
+    """The camera of ``calib_0.txt`` or ``calib_1.txt``; ``calib_stereo.txt`` beside them has T_right_left, metres."""
+    (model, numbers, *size) = DSO.findall(text)[0]
+    listed = dict(zip(("fx", "fy", "cx", "cy"), numbers.split(), strict=False))
+    f = Fields({**listed, "coefficients": numbers.split()[4:], "size": size}, str(path))
+    camera, coefficients = f.optics("fx fy cx cy", f.size("size"), "none").camera, f.numbers("coefficients")
+    lens = Lens(camera)
+    if any(coefficients):
+        lens = f.lens("coefficients", camera, MODELS[model.lower()] or "none", coefficients)
+    stereo, T = path.with_name(re.sub(r"_[01]\.", "_stereo.", path.name)), None
+    if stereo != path and stereo.is_file():
+        rig = Fields({"T_right_left": read_text(stereo, "calibration").split()}, str(stereo))
+        T = rig.pose("T_right_left") if "_1." in path.name else RigidTransform.identity()
+    return [CalibratedCamera(path.stem, lens, T)]
 
 
 def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
@@ -138,16 +170,20 @@ def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:
     """The camera of a ``sensor.yaml``: ``T_BS`` maps the sensor to the body, metres; it is named by its folder."""
     T = f.pose("T_BS").inverse() if "T_BS" in f else None
     name = path.parent.name if path.stem == "sensor" and path.parent.name else path.stem
-    return [CalibratedCamera(name, _pinhole_lens(f, "distortion_coefficients"), T)]
+    return [CalibratedCamera(name, _pinhole_lens(f), T)]
 
 
-def _pinhole_lens(f: Fields, distortion: str) -> Lens:
+def _pinhole_lens(f: Fields) -> Lens:
     kind = f.text("camera_model", "pinhole")
     if kind.lower() != "pinhole":
         remedy = "calibrate as pinhole with radtan or equidistant"
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
-    fx, fy, cx, cy = f.numbers("intrinsics", 4)
-    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.size("resolution")))
+    key = f.spelt(("intrinsics", "camera_matrix"))
+    fx, fy, cx, cy = f.numbers(key, 4)
+    if "sensor_type" in f and "resolution" not in f:
+        fy, cx = cx, fy  # OpenLORIS lists fx, cx, fy, cy
+    size = f.size("resolution") if "resolution" in f else f.size("width", "height")
+    return f.distorted(f.spelt(("distortion_coeffs", "distortion_coefficients")), f.camera(key, (fx, fy, cx, cy), size))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -7,6 +7,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import UNKNOWN_SIZE, CalibratedCamera, read_cameras, rig_of
+from rille.datasets.cameras.model import of_size, relative_pose
 from rille.stages.geometry.geometry import Camera, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -413,11 +414,11 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     np.testing.assert_allclose(rig(*mixed), between.matrix34, atol=1e-12)
     expected = (b @ (b.inverse() @ a).inverse()).matrix34
     np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
-    for key in ("T_BS", "T_SC"):
+    for key in ("T_BS", "T_SC", "T_b"):
         found = rig((key, a.inverse()), (key, b.inverse()), name="camera_")
         np.testing.assert_allclose(found, between.matrix34, atol=1e-12)
-    with raises("RIL-766", "camera_0.T_b"):
-        rig(("T_b", a.inverse()), ("T_b", b.inverse()), name="camera_")
+    with raises("RIL-766", "camera_0.T_c"):
+        rig(("T_c", a.inverse()), ("T_c", b.inverse()), name="camera_")
 
 
 def test_kalibr_of_one_camera(tmp_path):
@@ -1027,6 +1028,94 @@ def test_one_line_that_names_file_and_key(tmp_path, text, expected):
 
 
 # -- as cameras come with them -----------------------------------------------------------------------------------------
+
+MRPT = """# Left camera calibration parameters:
+[CAMERA_PARAMS_LEFT]
+resolution = [1024 768]
+cx         = 507.902
+cy         = 387.206  // +/- 0.1
+fx         = 837.619
+fy         = 839.808
+dist       = [-3.636834e-001 1.766205e-001 0.0 0.0 -5.234034e-002]    // The order is: [K1 K2 T1 T2 K3]
+
+[CAMERA_PARAMS_RIGHT]
+resolution = [1024 768]
+cx         = 511.174
+cy         = 388.441
+fx         = 836.762
+fy         = 838.133
+dist       = [0.0 0.0 0.0 0.0 0.0]
+
+# Relative pose of the right camera wrt to the left camera:
+[CAMERA_PARAMS_LEFT2RIGHT_POSE]
+translation_only     = [1.193203e-001 -3.361637e-004 3.729054e-004]
+pose_quaternion      = [0.119320 -0.000336 0.000373 {} -0.000329 -0.001567 0.003142]
+"""
+
+
+def test_mrpt_states_the_right_camera_in_the_left_ones_frame(tmp_path):
+    left, right = read_cameras(written(tmp_path, MRPT.format("0.999994"), "camera_params_raw_1024x768.txt"))
+    assert left.lens == Lens(
+        Camera(837.619, 839.808, 507.902, 387.206, 1024, 768), "radtan", (-0.3636834, 0.1766205, 0, 0, -0.05234034)
+    )
+    assert (right.size, right.lens.camera.fy) == ((1024, 768), 838.133)
+    np.testing.assert_allclose(centre(right.T_camera_reference), [0.11932, -0.000336, 0.000373], atol=1e-12)
+    with raises("RIL-767", "CAMERA_PARAMS_LEFT2RIGHT_POSE pose_quaternion", "length 0.5"):
+        read_cameras(written(tmp_path, MRPT.format("0.5")))
+    with raises("RIL-113", "CAMERA_PARAMS_RIGHT fx"):
+        read_cameras(written(tmp_path, MRPT.format("1").replace("fx         = 836.762\n", "")))
+
+
+def test_dsec(tmp_path):
+    chain = {k: RigidTransform(rotation_exp([0.01 * k, 0.0, 0.02]), [-0.05 * k, 0.001, 0.002]) for k in (1, 2, 3)}
+    size = {0: [640, 480], 1: [1440, 1080], 2: [1440, 1080], 3: [640, 480]}
+    turns = {k: rotation_exp([0.0, 0.01 * k, 0.0]) for k in size}
+    lens = {"camera_model": "pinhole", "distortion_coeffs": [-0.1, 0.2, 0, 0], "distortion_model": "radtan"}
+    optics = {f"cam{k}": {"camera_matrix": [500 + k, 501 + k, 300, 200], "resolution": size[k], **lens} for k in size}
+    optics |= {f"camRect{k}": {"camera_matrix": [400, 400, 310, 210], "resolution": size[k]} for k in size}
+    placed = {f"T_{k}{k - 1}": np.vstack([T.matrix34, [0, 0, 0, 1]]).tolist() for k, T in chain.items()}
+    placed |= {f"R_rect{k}": R.tolist() for k, R in turns.items()}
+    text = json.dumps(
+        {"intrinsics": optics, "extrinsics": placed, "disparity_to_depth": {"cams_12": np.eye(4).tolist()}}
+    )
+    cameras = read_cameras(written(tmp_path, text, "cam_to_cam.yaml"))
+    assert [camera.name for camera in cameras] == ["cam0", "cam1", "cam2", "cam3"]
+    left, right = of_size(cameras, ((1440, 1080), (1440, 1080)))
+    assert left.lens == Lens(Camera(501, 502, 300, 200, 1440, 1080), "radtan", (-0.1, 0.2, 0, 0))
+    np.testing.assert_allclose(relative_pose(left, right).matrix34, chain[2].matrix34, atol=1e-12)
+    R_left, R_right = (RigidTransform(turns[k], np.zeros(3)) for k in (1, 2))
+    expected = R_right @ chain[2] @ R_left.inverse()
+    np.testing.assert_allclose(relative_pose(left.rectified, right.rectified).matrix34, expected.matrix34, atol=1e-12)
+    assert left.rectified.lens == Lens(Camera(400, 400, 310, 210, 1440, 1080))
+
+
+def test_calibrations_of_4seasons(tmp_path):
+    text = "{} 501.47 501.48 421.79 167.65 {}\n800 400\ncrop\n800 400\n"
+    pose = np.eye(4)
+    pose[0, 3] = -0.3005
+    (tmp_path / "undistorted_calib_stereo.txt").write_text("\n".join(" ".join(map(str, row)) for row in pose))
+    left, right = (
+        read_cameras(written(tmp_path, text.format("Pinhole", "0.0 0.0 0.0 0.0"), f"undistorted_calib_{k}.txt"))[0]
+        for k in (0, 1)
+    )
+    assert left.lens == Lens(Camera(501.47, 501.48, 421.79, 167.65, 800, 400))
+    np.testing.assert_allclose(centre(relative_pose(left, right)), [0.3005, 0, 0], atol=1e-12)
+    (bent,) = read_cameras(written(tmp_path, text.format("EquiDistant", "-0.01 0.02 0.003 0.0004"), "calib_0.txt"))
+    assert (bent.lens.model, bent.lens.coefficients) == ("fisheye", (-0.01, 0.02, 0.003, 0.0004))
+    assert bent.T_camera_reference is None
+    with raises("RIL-370", "calib_1.txt: coefficients"):
+        read_cameras(written(tmp_path, text.format("Pinhole", "0.93"), "calib_1.txt"))
+
+
+def test_openloris_lists_columns_before_rows(tmp_path):
+    part = "{}:\n  sensor_type: camera\n  width: 848\n  height: 480\n  model: pinhole\n"
+    part += (
+        "  intrinsics: !!opencv-matrix\n    rows: 1\n    cols: 4\n    dt: d\n    data: [611.4, 433.2, 611.5, 249.5]\n"
+    )
+    names = "d400_color_optical_frame", "d400_depth_optical_frame"
+    cameras = read_cameras(written(tmp_path, "%YAML:1.0\n" + "".join(map(part.format, names)), "sensors.yaml"))
+    assert [camera.lens.camera for camera in cameras] == [Camera(611.4, 611.5, 433.2, 249.5, 848, 480)] * 2
+
 
 ZED = """[LEFT_CAM_{0}]
 fx={f}

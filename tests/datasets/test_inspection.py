@@ -364,6 +364,18 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration.sizes == ((960, 600), (960, 600))
 
 
+def test_calibrations_numbered_as_the_cameras_are_a_pair(tmp_path):
+    write_images(tmp_path, [f"cam{side}/{k}.png" for side in (0, 1) for k in range(3)])
+    for k in (0, 1):
+        text = f"Pinhole 50 50 31 23 0.0\n{SIZE[0]} {SIZE[1]}\ncrop\n{SIZE[0]} {SIZE[1]}\n"
+        (tmp_path / f"undistorted_calib_{k}.txt").write_text(text)
+    (tmp_path / "undistorted_calib_stereo.txt").write_text("1 0 0 -0.3\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    found = inspect(tmp_path).calibration
+    assert found is not None
+    assert found.files == ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
+    assert found.baseline == pytest.approx(0.3)
+
+
 def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path):
     names = ["1", "2"]
     write_images(tmp_path, [*both("depth_{side}/{name}.png", names), *both("{side}/{name}.png", names)])
