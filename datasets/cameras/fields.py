@@ -14,6 +14,7 @@ import numpy as np
 from rille.datasets.cameras.model import UNKNOWN_SIZE
 from rille.datasets.cameras.text import parse_nested
 from rille.datasets.text.reading import GREATEST, read_text
+from rille.datasets.text.units import LENGTHS, unit_of
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
@@ -154,11 +155,17 @@ class Fields:
                 raise self.error("RIL-122", key, f"= {value:g} is no image size in pixels")
         return int(width), int(height)
 
+    def metres(self, key: str) -> float:
+        """Length of the unit that a key's name, or else the entry ``unit`` or ``units`` states; 1 if none does."""
+        stated = unit_of(key) or unit_of(f"[{self.values.get('unit', self.values.get('units', ''))}]")
+        return LENGTHS.get(stated, 1.0)
+
     def transform(self, rotation: str, translation: str) -> RigidTransform:
-        """Rigid transform from a 3 x 3 matrix and three numbers."""
+        """Rigid transform from a 3 x 3 matrix and three numbers, by :meth:`metres`."""
         if rotation not in self:
             self.check_turn()  # it may stand there in another form
-        return self.rigid(rotation, self.matrix(rotation, 3, 3), np.array(self.numbers(translation, 3)))
+        t = np.array(self.numbers(translation, 3)) * self.metres(translation)
+        return self.rigid(rotation, self.matrix(rotation, 3, 3), t)
 
     def pose(self, key: str) -> RigidTransform:
         """Rigid transform from a 4 x 4 or 3 x 4 matrix."""

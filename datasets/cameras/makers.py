@@ -20,7 +20,7 @@ from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
 from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.units import METRIC, unit_of, unitless
+from rille.datasets.text.units import unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -252,7 +252,7 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
 def beside(f: Fields) -> RigidTransform | None:
     """T_right_left of parallel cameras by a ``baseline``, metres or the unit in its key; None if there is none."""
     keys = [key for key in f.values if unitless(key).lower() == "baseline" and key in f]
-    return parallel(f.number(keys[0]) * METRIC.get(unit_of(keys[0]), 1.0)) if len(keys) == 1 else None
+    return parallel(f.number(keys[0]) * f.metres(keys[0])) if len(keys) == 1 else None
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:

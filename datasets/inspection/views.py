@@ -207,7 +207,8 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
     text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
-    by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
+    turns = 'images.left = "*[02468].png", images.right = "*[13579].png", images.pair = "order"'
+    by_name = f"give the folder of both cameras, {called}, or write a manifest by hand (of images by turns {turns})"
     remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"
     text += "" if images else f" ({DEPTH} folders deep)"
     if images and sum(counts) in (0, len(images)) and not all(counts):

@@ -1029,6 +1029,17 @@ def test_one_line_that_names_file_and_key(tmp_path, text, expected):
 
 # -- as cameras come with them -----------------------------------------------------------------------------------------
 
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("inch", 0.0254), ("m", 1.0)])
+@pytest.mark.parametrize("form", ['"T": {}, "unit": "{}"', '"T_{1}": {0}', '"translation ({1})": {0}'])
+def test_units_of_length_that_a_file_states(tmp_path, form, unit, metres):
+    k = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
+    t = [-0.12 / metres, 0.0, 0.0]
+    text = f'{{"K1": {k}, "K2": {k}, "R": {np.eye(3).tolist()}, {form.format(t, unit)}}}'
+    right = read_cameras(written(tmp_path, text, "stereo.json"))[1]
+    np.testing.assert_allclose(centre(right.T_camera_reference), [0.12, 0, 0], atol=1e-12)
+
+
 MRPT = """# Left camera calibration parameters:
 [CAMERA_PARAMS_LEFT]
 resolution = [1024 768]

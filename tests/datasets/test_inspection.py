@@ -285,6 +285,18 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
 def test_dead_reckoning_is_no_truth(tmp_path, name, kind):
     write_lines(tmp_path / name, ["# time x y z qx qy qz qw", *(f"{k} {k} 0 0 0 0 0.6 0.8" for k in range(3))])
     assert table_kind(tmp_path / name, 2) == kind
+    for rows in (["{} 1 0 0 0 0.6 0 0.8"], ["1 0 0 {} 0 1 0 0 0 0 1 0"]):
+        write_lines(tmp_path / name, [row.format(k) for row in rows for k in range(3)])
+        assert table_kind(tmp_path / name, 3) == kind, "without names of columns, too"
+
+
+@pytest.mark.parametrize(
+    "place", ["48\N{DEGREE SIGN} 6.000000' N,11\N{DEGREE SIGN} 30.0' E", "4806.0,1130.0", "48:06:00,11:30:00"]
+)
+def test_degrees_and_minutes_are_told_with_what_to_write_instead(tmp_path, place):
+    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude,altitude", *(f"{k},{place},500" for k in range(3))])
+    with raises("RIL-805", "decimal degrees (neither minutes"):
+        table_kind(tmp_path / "gnss.csv", 3)
 
 
 @pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
