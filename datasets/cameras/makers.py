@@ -17,7 +17,7 @@ from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.cameras.opencv import relative
-from rille.datasets.cameras.text import assignments, entries
+from rille.datasets.cameras.text import assignments, entries, words
 from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.units import unitless
@@ -41,16 +41,8 @@ class _Sections(dict[str, Fields]):
 def _sections(text: str, path: Path) -> _Sections:
     _, *parts = SECTION.split(text)
     named = zip(parts[::2], map(ENTRY.findall, parts[1::2]), strict=True)
-    found = {name.upper(): entries(((k.lower(), v) for k, v in rows), f"{path} {name}") for name, rows in named}
-    return _Sections({name: Fields(_listed(values), str(path), f"{name} ") for name, values in found.items()})
-
-
-def _listed(values: Mapping[str, str]) -> dict[str, str | list[str]]:
-    """Entries with a list of words for a text in brackets, as of MATLAB."""
-    return {
-        key: value.strip("[]").replace(";", " ").split() if value.startswith("[") else value
-        for key, value in values.items()
-    }
+    found = {name.upper(): entries(((k.lower(), words(v)) for k, v in rows), f"{path} {name}") for name, rows in named}
+    return _Sections({name: Fields(values, str(path), f"{name} ") for name, values in found.items()})
 
 
 ZED_SIZES = {
@@ -185,13 +177,13 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
 
 def numbers_of_matrix(text: str) -> list[str]:
     """The nine numbers fx 0 cx, 0 fy cy, 0 0 1 of a text, and perhaps a tenth; empty for any other text."""
-    words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
+    numbers = re.sub(r"[\[\],;]", " ", text[:1000]).split()
     try:
-        k = [float(word) for word in words[:9]]
+        k = [float(word) for word in numbers[:9]]
     except ValueError:
         return []
-    fits = len(words) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
-    return words if fits else []
+    fits = len(numbers) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
+    return numbers if fits else []
 
 
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
@@ -257,7 +249,7 @@ def beside(f: Fields) -> RigidTransform | None:
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here in metres."""
-    f = Fields(_listed(entries((line for line in assignments(text) if line[0]), str(path))), str(path))
+    f = Fields(entries(((key, words(value)) for key, value in assignments(text) if key), str(path)), str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import MODELS, Fields, by_count, flattened
+from rille.datasets.cameras.fields import Fields, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.images.pairing import natural
 from rille.datasets.text.reading import read_text
@@ -139,18 +139,16 @@ DSO = re.compile(
 
 def dso(text: str, path: Path) -> list[CalibratedCamera]:
     """The camera of ``calib_0.txt`` or ``calib_1.txt``; ``calib_stereo.txt`` beside them has T_right_left, metres."""
-    (model, numbers, *size) = DSO.findall(text)[0]
-    listed = dict(zip(("fx", "fy", "cx", "cy"), numbers.split(), strict=False))
-    f = Fields({**listed, "coefficients": numbers.split()[4:], "size": size}, str(path))
-    camera, coefficients = f.optics("fx fy cx cy", f.size("size"), "none").camera, f.numbers("coefficients")
-    lens = Lens(camera)
-    if any(coefficients):
-        lens = f.lens("coefficients", camera, MODELS[model.lower()] or "none", coefficients)
+    model, numbers, *size = DSO.findall(text)[0]
+    stated = {"intrinsics": numbers.split()[:4], "distortion_coeffs": numbers.split()[4:], "resolution": size}
+    f = Fields(stated, str(path))
+    bent = any(f.numbers("distortion_coeffs"))
+    f.values |= {"distortion_model": model} if bent else {"distortion_coeffs": []}
     stereo, T = path.with_name(re.sub(r"_[01]\.", "_stereo.", path.name)), None
     if stereo != path and stereo.is_file():
         rig = Fields({"T_right_left": read_text(stereo, "calibration").split()}, str(stereo))
         T = rig.pose("T_right_left") if "_1." in path.name else RigidTransform.identity()
-    return [CalibratedCamera(path.stem, lens, T)]
+    return [CalibratedCamera(path.stem, _pinhole_lens(f), T)]
 
 
 def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
@@ -159,10 +157,11 @@ def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
     kind = f.text("lensmodel")
     if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV\d+)", kind):
         raise f.error("RIL-769", "lensmodel", f"= {kind} is not read", "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE")
-    fx, fy, cx, cy, *coefficients = f.numbers("intrinsics")
-    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.size("imagersize"))
-    rt = np.array(f.numbers("extrinsics", 6))
-    lens = f.lens("intrinsics", camera, *by_count(tuple(coefficients)))
+    numbers, rt = f.numbers("intrinsics"), np.array(f.numbers("extrinsics", 6))
+    size = f.values.get("imagersize")
+    lens = _pinhole_lens(
+        Fields({"intrinsics": numbers[:4], "distortion_coeffs": numbers[4:], "resolution": size}, str(path))
+    )
     return [CalibratedCamera(path.stem, lens, f.rigid("extrinsics", rotation_exp(rt[:3]), rt[3:]))]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from rille.datasets.cameras.text import assignments, entries
+from rille.datasets.cameras.text import assignments, entries, words
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
@@ -50,9 +50,9 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
 def _entries(text: str, file: str) -> tuple[Fields, str]:
     """Entries ``key = numbers``, and the name of the lens model, alone on its line."""
     lines = assignments(text)
-    values = entries(((key, value.split()) for key, value in lines if key), file)
+    values = entries(((key, words(value)) for key, value in lines if key), file)
     lens = next((value for key, value in lines if not key and not HEADER.fullmatch(value)), "")
-    return Fields({key: words[0] if len(words) == 1 else words for key, words in values.items()}, file), lens
+    return Fields(values, file), lens
 
 
 def _lens(f: Fields, kind: str, camera: Camera) -> Lens:

@@ -109,9 +109,7 @@ def _image(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
     return values
 
 
-def find(
-    pattern: str, root: Path, lefts: Sequence[Path], size: tuple[int, int], key: str
-) -> tuple[list[Path], list[str]]:
+def find(pattern: str, root: Path, lefts: Sequence[Path], size: tuple[int, int], key: str) -> list[Path | InputError]:
     """The map of each left image, by name (without sides' tokens) or number; by order if names have nothing in common.
 
     Parameters
@@ -122,7 +120,7 @@ def find(
 
     Returns
     -------
-    maps, absent : for each image, and why it has no map; empty: it has.
+    For each image its map, or the error of one that is missing or cannot be read.
 
     Raises
     ------
@@ -143,31 +141,26 @@ def find(
             taken = [ours.get(one) for one in theirs]
     if not taken and len(maps) == len(lefts) and (len(maps) == 1 or not lacking):
         taken = [*maps]
+    those = ends(maps) if maps else f"none in {root}"
+    text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({those}) for {count(len(lefts), 'left image')}"
+    remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
     if not taken:
-        those = ends(maps) if maps else f"none in {root}"
-        text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({those}) for {count(len(lefts), 'left image')}"
-        text += f", none for {lacking}" if lacking else ""
-        remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
-        raise InputError("RIL-901", text, remedy=remedy)
-    troubles = [None if path is None else _trouble(path, size) for path in taken]
-    if None not in (trouble for trouble, path in zip(troubles, taken, strict=True) if path):
-        raise next(filter(None, troubles))
-    none = (f"{key} = {pattern!r} finds no map for {left.name}" for left in lefts)
-    why = [
-        words if path is None else trouble.message if trouble else ""
-        for words, path, trouble in zip(none, taken, troubles, strict=True)
-    ]
-    return [path or Path() for path in taken], why
+        raise InputError("RIL-901", text + (f", none for {lacking}" if lacking else ""), remedy=remedy)
+    missing = (InputError("RIL-901", f"{text}, none for {left.name}", remedy=remedy) for left in lefts)
+    found = [error if path is None else _sound(path, size) for path, error in zip(taken, missing, strict=True)]
+    if not any(isinstance(one, Path) for one in found):
+        raise next(one for one, path in zip(found, taken, strict=True) if path and isinstance(one, InputError))
+    return found
 
 
-def _trouble(path: Path, size: tuple[int, int]) -> InputError | None:
-    """The error by which a file is no map of this size, as far as its header tells; None: there is none."""
+def _sound(path: Path, size: tuple[int, int]) -> Path | InputError:
+    """The path, or the error by which the file is no map of this size, as far as its header tells."""
     try:
         with open_regular(path, "map", files.MOST_BYTES) as file, _refused(str(path)):
             _checked(file, size)
     except InputError as error:
         return error
-    return None
+    return path
 
 
 def last_number(path: Path) -> int:

@@ -6,17 +6,16 @@ import glob
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise, takewhile
+from itertools import takewhile
 from pathlib import Path
 
 from rille.datasets.images import pairing
 from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import line, split
-from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
+from rille.datasets.images.pairing import ImagePair, of_one_camera, side_of
 from rille.datasets.text.names import shell_word
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
@@ -70,14 +69,14 @@ Sets = dict[tuple[int, str], tuple[list[Path], list[Path]]]
 
 
 def _by_token(images: list[Path], names: list[str]) -> Sets:
-    """Images whose names have a side's token, in sets of one place; a set may have one side alone."""
+    """Images whose names have a side's token, in sets of one place and kind; a set may have one side alone."""
     named: Named = defaultdict(list)
     groups: Sets = defaultdict(lambda: ([], []))
     for path, name in zip(images, names, strict=True):
         if (at := side_of(name)) is not None:
             row, side, neutral = at
-            named[row, neutral.rpartition("/")[0]].append((neutral, side, path))
-    for (row, place), found in _of_one_kind(named):
+            named[row, f"{neutral.rpartition('/')[0]} {path.suffix.lower()}"].append((neutral, side, path))
+    for (row, place), found in named.items():
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
@@ -217,21 +216,6 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
-
-
-def _of_one_kind(named: Named) -> Iterator[tuple[tuple[int, str], list[tuple[str, int, Path]]]]:
-    """Images of one place and kind, or of several kinds in turns (1.png, 2.jpg, 3.png), with the place's name."""
-    for (row, place), found in named.items():
-        kinds = defaultdict(list)
-        for neutral, side, path in found:
-            kinds[path.suffix.lower()].append((neutral, side, path))
-        row_of_kinds = [path.suffix.lower() for _, _, path in sorted(found, key=lambda of: (of[1], natural(of[0])))]
-        changes = sum(a != b for a, b in pairwise(row_of_kinds))
-        shapes = {re.sub(r"\d+", "", neutral) for neutral, _, _ in found}
-        # Of two kinds with the same names one is made of the other; of a few of another kind nothing is known.
-        in_turns = len({of[:2] for of in found}) == len(found) and len(shapes) == 1 and changes > 2 * len(kinds)
-        for kind, of_kind in [("", found)] if in_turns else kinds.items():
-            yield (row, f"{place} {kind}"), of_kind
 
 
 def pattern(paths: list[Path], folder: Path) -> str:

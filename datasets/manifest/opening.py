@@ -151,15 +151,15 @@ def _with_maps(
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
     frames = [k for k, pair in enumerate(pairs) if not pair.absent]
-    lefts = [pairs[k].left for k in frames]
     size = sequence.rig.left.width, sequence.rig.left.height
     claimed = stated.sigma if isinstance(stated, Disparity) else None
-    patterns = {"column_disparity": stated.left} | ({"disparity_std": claimed} if isinstance(claimed, str) else {})
+    patterns = [("column_disparity", "left", stated.left)]
+    patterns += [("disparity_std", "sigma", claimed)] if isinstance(claimed, str) else []
     maps, absent = dict[str, dict[int, Path]](), dict[int, str]()
-    for (array, pattern), name in zip(patterns.items(), ("left", "sigma"), strict=False):
-        found, why = disparities.find(pattern, root, lefts, size, f"{key}.{name}")
-        maps[array] = dict(zip(frames, found, strict=True))
-        absent |= {frame: words for frame, words in zip(frames, why, strict=True) if words and frame not in absent}
+    for array, name, pattern in patterns:
+        found = disparities.find(pattern, root, [pairs[k].left for k in frames], size, f"{key}.{name}")
+        maps[array] = {k: one for k, one in zip(frames, found, strict=True) if isinstance(one, Path)}
+        absent |= {k: one.message for k, one in zip(frames, found, strict=True) if isinstance(one, InputError)}
     common = {"size": list(size), "sign": stated.sign, "sigma": None if isinstance(claimed, str) else claimed}
 
     def source(frame: int) -> Source:

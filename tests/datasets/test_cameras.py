@@ -1114,7 +1114,7 @@ def test_calibrations_of_4seasons(tmp_path):
     (bent,) = read_cameras(written(tmp_path, text.format("EquiDistant", "-0.01 0.02 0.003 0.0004"), "calib_0.txt"))
     assert (bent.lens.model, bent.lens.coefficients) == ("fisheye", (-0.01, 0.02, 0.003, 0.0004))
     assert bent.T_camera_reference is None
-    with raises("RIL-370", "calib_1.txt: coefficients"):
+    with raises("RIL-370", "calib_1.txt: distortion_coeffs"):
         read_cameras(written(tmp_path, text.format("Pinhole", "0.93"), "calib_1.txt"))
 
 

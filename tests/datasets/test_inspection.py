@@ -430,14 +430,6 @@ def test_places_in_images_become_a_table(tmp_path):
     assert any("EXIF of 2 of 3 left images" in line and "exiftool" in line for line in inspect(tmp_path).unread)
 
 
-def test_kinds_of_images_in_turns_are_one_set(tmp_path):
-    write_images(tmp_path, both("{side}/{name}.png", ["1", "3", "5"]) + both("{side}/{name}.jpg", ["2", "4"]))
-    views = inspect(tmp_path).views
-    assert (views.left, views.right, views.pairs, views.others) == ("left/*", "right/*", 5, ())
-    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "3", "5"]))  # each png once more, as a jpg
-    assert inspect(tmp_path).views.pairs == 5
-
-
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
     write_images(tmp_path, days)
