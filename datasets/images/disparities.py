@@ -146,7 +146,7 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], size: tuple[int, int],
     remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
     if not taken:
         raise InputError("RIL-901", text + (f", none for {lacking}" if lacking else ""), remedy=remedy)
-    missing = (InputError("RIL-901", f"{text}, none for {left.name}", remedy=remedy) for left in lefts)
+    missing = (InputError("RIL-911", f"{text}, none for {left.name}", remedy=remedy) for left in lefts)
     found = [error if path is None else _sound(path, size) for path, error in zip(taken, missing, strict=True)]
     if not any(isinstance(one, Path) for one in found):
         raise next(one for one, path in zip(found, taken, strict=True) if path and isinstance(one, InputError))
