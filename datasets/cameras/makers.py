@@ -7,7 +7,7 @@ pairs (2014 and 2021), and figures by key.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,18 +31,17 @@ ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\[[^\]\n]*\]|\S+)", re.MULTI
 """Of a ``.conf`` or ``.ini``: the head of a section, and one of its entries, a word or a list in brackets."""
 
 
-class _Sections(dict[str, Fields]):
-    """Entries of each section by its name in capitals, by keys in small letters; none of one that is not there."""
-
-    def __missing__(self, name: str) -> Fields:
-        return Fields({}, next(iter(self.values())).file, f"{name} ")
-
-
-def _sections(text: str, path: Path) -> _Sections:
+def _sections(text: str, path: Path) -> Callable[[str], Fields]:
+    """Entries of a section by its name in capitals, by keys in small letters; none of one that is not there."""
     _, *parts = SECTION.split(text)
     named = zip(parts[::2], map(ENTRY.findall, parts[1::2]), strict=True)
     found = {name.upper(): entries(((k.lower(), words(v)) for k, v in rows), f"{path} {name}") for name, rows in named}
-    return _Sections({name: Fields(values, str(path), f"{name} ") for name, values in found.items()})
+    return lambda name: Fields(found.get(name, {}), str(path), f"{name} ")
+
+
+def has_section(part: str) -> Callable[[str], bool]:
+    """Whether a text has a section with this part of a name."""
+    return lambda text: any(part in name.upper() for name in SECTION.findall(text))
 
 
 ZED_SIZES = {
@@ -66,12 +65,13 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     the size of a single one is that of the images.
     """
     parts = _sections(text, path)
-    names = [name.removeprefix("LEFT_CAM_") for name in parts if name.startswith("LEFT_CAM_")]
-    stereo = parts["STEREO"]
+    heads = dict.fromkeys(map(str.upper, SECTION.findall(text)))
+    names = [name.removeprefix("LEFT_CAM_") for name in heads if name.startswith("LEFT_CAM_")]
+    stereo = parts("STEREO")
     cameras = []
     for name in names:
         size = ZED_SIZES.get(name, UNKNOWN_SIZE) if len(names) > 1 else UNKNOWN_SIZE
-        left, right = (_zed_lens(parts[f"{side}_CAM_{name}"], parts[f"{side}_DISTO"], size) for side in SIDES)
+        left, right = (_zed_lens(parts(f"{side}_CAM_{name}"), parts(f"{side}_DISTO"), size) for side in SIDES)
         rx, cv, rz, ty, tz = (
             stereo.number(f"{key}_{name.lower()}", stereo.number(key, 0.0)) for key in ("rx", "cv", "rz", "ty", "tz")
         )
@@ -96,8 +96,8 @@ OF_RIGHT = "LEFT2RIGHT_POSE"
 def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras of MRPT's stereo calibration (Malaga's data sets); lengths are metres."""
     parts = _sections(text, path)
-    prefix = next(name for name in parts if name.endswith(OF_RIGHT)).removesuffix(OF_RIGHT)
-    placed, of_sides = parts[prefix + OF_RIGHT], [parts[prefix + side] for side in SIDES]
+    prefix = next(name.upper() for name in SECTION.findall(text) if OF_RIGHT in name.upper()).removesuffix(OF_RIGHT)
+    placed, of_sides = parts(prefix + OF_RIGHT), [parts(prefix + side) for side in SIDES]
     cameras = (f.optics("fx fy cx cy", f.size("resolution"), "none").camera for f in of_sides)
     left, right = [f.distorted("dist", camera) for f, camera in zip(of_sides, cameras, strict=True)]
     for f in of_sides:

@@ -1077,6 +1077,12 @@ def test_mrpt_states_the_right_camera_in_the_left_ones_frame(tmp_path):
         read_cameras(written(tmp_path, MRPT.format("1").replace("fx         = 836.762\n", "")))
 
 
+@pytest.mark.parametrize("text", ["; [LEFT_CAM_HD]\n", "x_LEFT2RIGHT_POSE]\n", "[[LEFT_CAM_HD]\nfx=1\n"])
+def test_heads_of_sections_elsewhere_are_none(tmp_path, text):
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, text, "a.conf"))
+
+
 def test_dsec(tmp_path):
     chain = {k: RigidTransform(rotation_exp([0.01 * k, 0.0, 0.02]), [-0.05 * k, 0.001, 0.002]) for k in (1, 2, 3)}
     size = {0: [640, 480], 1: [1440, 1080], 2: [1440, 1080], 3: [640, 480]}
