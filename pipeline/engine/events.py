@@ -12,9 +12,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine.graph import Handle, Took
+from rille.pipeline.engine.graph import Handle
 from rille.pipeline.engine.runtime.atomic import named
-from rille.pipeline.engine.spec import map_ports
+from rille.pipeline.engine.task import Took, map_ports
 
 
 class Ledger:

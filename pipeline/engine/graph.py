@@ -20,25 +20,9 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, NamedTuple, cast
 
-from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
+from rille.pipeline.engine.task import Refs, Spec, flatten_ports, map_ports
 from rille.stages.core.declare import F, Params, Stage
-
-
-@dataclass(frozen=True, slots=True)
-class Took:
-    """What a task took: ``seconds`` and peak memory [bytes] of the call, ``kernel`` seconds of the stage itself.
-
-    ``started`` is when the call began (seconds since 1970); ``compiling`` are the seconds for which it compiled;
-    ``worker`` is the name of the dask worker that ran it.
-    """
-
-    seconds: float = 0.0
-    peak_rss: int = 0
-    started: float = 0.0
-    kernel: float = 0.0
-    compiling: float = 0.0
-    worker: str = ""
 
 
 @dataclass(eq=False, slots=True)

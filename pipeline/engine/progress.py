@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, TextIO
 from rille.pipeline.engine.plain import plain, raw
 
 if TYPE_CHECKING:
-    from rille.pipeline.engine.graph import Handle, Took
+    from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.task import Took
 
 INTERVAL = 5.0
 """Seconds between plain lines."""

@@ -22,8 +22,8 @@ from rille.stages.core.errors import told
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.store.artifact import Ref
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.engine.store.manifest import Ref
 
 Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""

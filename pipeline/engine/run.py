@@ -33,13 +33,12 @@ from typing import Any
 from rille.pipeline.engine import memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Graph, Handle, Took, Waiting
+from rille.pipeline.engine.graph import Graph, Handle, Waiting
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
-from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
+from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.task import Outcome, code_changed
+from rille.pipeline.engine.task import Outcome, Refs, Took, code_changed, key_of, map_ports, recipe
 from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
 from rille.stages.core.quantities import some

@@ -41,9 +41,8 @@ from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take
 from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
-from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Outcome, ensure
+from rille.pipeline.engine.store.artifact import Ref
+from rille.pipeline.engine.task import Outcome, Refs, Spec, ensure, flatten_ports, map_ports
 from rille.stages.core.errors import ConfigError, RilleError
 
 KINDS = ("dask", "inline")

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.engine.store.base import Store, StoreError
 
 FOLDER = "roots"
 

@@ -16,8 +16,8 @@ from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
 from rille.pipeline.engine.plain import one_line, warn
 from rille.pipeline.engine.run import Failure
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import FORMS, Output, unpack

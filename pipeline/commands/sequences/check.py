@@ -21,8 +21,7 @@ from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.commands import batch
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.engine.store.base import Store, StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name_graph
 from rille.pipeline.flow.reconstruction import vertical

@@ -8,12 +8,9 @@ from collections import defaultdict
 from collections.abc import Collection, Iterator
 
 from rille.pipeline.engine.failures import CLOSED
-from rille.pipeline.engine.store.archive import BrokenError
-from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.folder import clear_errors, files
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.store.manifest import STAGE, reference
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
+from rille.pipeline.engine.store.arrays import DamagedError, array_digests, output_digest
+from rille.pipeline.engine.store.artifact import STAGE, BrokenError, reference
+from rille.pipeline.engine.store.base import GoneError, Store, clear_errors, files
 
 GRACE = 24 * 3600.0
 """Seconds before what no run is known to use goes: no single task takes a day."""

@@ -18,9 +18,10 @@ import pytest
 from toys.numbers import NumbersParams
 
 from rille.pipeline.engine import progress
-from rille.pipeline.engine.graph import Graph, Took
+from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.runtime.kernels import Compiling, Locator
+from rille.pipeline.engine.task import Took
 
 ROOT = Path(__file__).resolve().parents[3]
 CALLEE = "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return x * 2\n"

@@ -21,10 +21,9 @@ from rille.pipeline.engine import packages, progress, provenance
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
-from rille.pipeline.engine.spec import Spec, recipe
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import ensure
+from rille.pipeline.engine.task import Spec, ensure, recipe
 from rille.stages.core.declare import NoParams
 
 NO = NoParams()
