@@ -1,8 +1,7 @@
 """``rille rig``: one rig from the matches of several runs, for manifests to pin.
 
 Each run repairs its rig by its own images, so that rigs of pieces of one log differ a little. Here the matches of all
-runs together decide which parameters depart from the calibration, as those of all pairs do in a run. The value of each
-parameter is the mean of the runs' own estimates, weighted by their covariances.
+runs together decide which parameters depart from the calibration, and by how much, as those of all pairs do in a run.
 """
 
 from __future__ import annotations
@@ -43,11 +42,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Joint:
-    """The rig of all runs, its parameters, their joint values (5,) in radians, and each run's own estimate."""
+    """The rig of all runs, its parameters, and each run's own estimate."""
 
     rig: Rig
     parameters: tuple[Parameter, ...]
-    values: Floats
     estimates: tuple[Estimate, ...]
 
 
@@ -112,29 +110,24 @@ def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigPa
         text = f"run {empty} has no pair with {MIN_MATCHES} matches"
         raise InputError("RIL-030", text, remedy="leave it out, or choose more frames")
     decision = decide(given, [pair for pairs in matches.values() for pair in pairs], params)
-    observed = [p.observed for p in decision.parameters]
-    priors, estimates, freed = params.priors(given), [], np.flatnonzero(decision.free())
-    normal, pull = np.zeros((len(freed), len(freed))), np.zeros(len(freed))
+    observed, priors = [p.observed for p in decision.parameters], params.priors(given)
+    estimates = []
     for name, pairs in matches.items():
-        fit = adjust(given, pairs, observed, priors, rival=False)
-        values, covariance, _ = solution(fit, observed, priors, rival=False)
-        values, covariance = values[: len(NAMES)], covariance[: len(NAMES), : len(NAMES)]
-        estimates.append(Estimate(name, values, np.sqrt(np.diag(covariance))))
-        inverse = np.linalg.inv(covariance[np.ix_(freed, freed)])
-        normal, pull = normal + inverse, pull + inverse @ values[freed]
-    values = np.zeros(len(NAMES))
-    values[freed] = np.linalg.solve(normal, pull)
-    return Joint(corrected(given, values), decision.parameters, values, tuple(estimates))
+        values, covariance, _ = solution(
+            adjust(given, pairs, observed, priors, rival=False), observed, priors, rival=False
+        )
+        estimates.append(Estimate(name, values[: len(NAMES)], np.sqrt(np.diag(covariance))[: len(NAMES)]))
+    return Joint(corrected(given, decision.correction), decision.parameters, tuple(estimates))
 
 
 def disagreements(found: Joint, significance: float) -> Iterator[str]:
     """Lines on estimates of runs that differ from the joint one by more than ``significance`` standard deviations."""
     for k, parameter in enumerate(found.parameters):
-        centre = parameter.asked if not parameter.freed else found.values[k]
         for one in found.estimates if parameter.observed else ():
-            away = abs(one.values[k] - centre) / one.sigma[k]
+            off = one.values[k] - parameter.asked
+            away = abs(off) / one.sigma[k]
             if away > significance:
-                turn = math.degrees(one.values[k] - centre)
+                turn = math.degrees(off)
                 text = f"{parameter.name.replace('_', ' ')} of run {one.run} is {turn:+.3f} degrees off the others"
                 yield warning("RIL-025", f"{text}, {away:.0f} standard deviations: did the rig move between them?")
 
@@ -145,17 +138,16 @@ def _table(found: Joint) -> Iterator[str]:
     heads = names if len(set(names)) == len(names) else [one.run.rpartition("/")[2] for one in found.estimates]
     yield "  ".join([f"{'degrees':17s}", *(f"{head:>17.17s}" for head in ["all", *heads])])
     for k, p in enumerate(found.parameters):
-        value = found.values[k] if p.freed else p.asked
         # The estimate of a parameter that is not observed would be the prior.
         own = [(one.values[k], one.sigma[k]) for one in found.estimates if p.observed]
-        each = [(value, p.sigma), *own]
+        each = [(p.asked, p.sigma), *own]
         cells = "  ".join(f"{math.degrees(v):+8.3f} +- {math.degrees(s):.3f}" for v, s in each)
         yield f"{p.name.replace('_', ' '):17s}  {cells}  {'corrected' if p.freed else 'as given: ' + p.why}"
 
 
 def _toml(found: Joint) -> str:
     """The file's text: the rig, and how it was estimated."""
-    turned = dict(zip(NAMES, np.degrees(found.values).tolist(), strict=True))
+    turned = {p.name: math.degrees(p.value) for p in found.parameters}
     content = {"runs": [one.run for one in found.estimates], "corrected_by_degrees": turned}
     head = "# A rig for manifests: [rig] file = ... ; x_right = R x_left + t, metres, rows of [R | t].\n"
     return head + tomli_w.dumps(content | {"rig": found.rig.to_dict()})
