@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rille.pipeline.export.comparison import crosscheck_poses
+import numpy as np
+
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, artifact
+from rille.pipeline.export.view import RunView, artifact, by_frame
 from rille.pipeline.export.writers import FRAME, WORLDS, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.agreement import carried
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -36,6 +38,15 @@ def _write_pieces(path: Path, run: RunView) -> None:
         if number != trajectory.meta["main"]:
             piece = path.with_name(path.name.replace("*", str(number + 1)))
             _write_tum(piece, run, world_poses(trajectory, number), number)
+
+
+def crosscheck_poses(view: RunView, agreement: Bundle) -> Floats:
+    """Poses (frame, 3, 4) of the crosscheck's left cameras in our world, NaN where ours is in another piece."""
+    poses, trajectory = by_frame(view, agreement, "poses"), view.bundle(view.products.trajectory)
+    if trajectory is not None:  # other pieces, with the lost frames after them, have their own frames of reference
+        piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
+        poses[carried(piece) != trajectory.meta["main"]] = np.nan
+    return poses
 
 
 def _posed(run: RunView) -> tuple[object, ...]:

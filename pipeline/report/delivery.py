@@ -18,7 +18,6 @@ from rille.pipeline.report.canvas import Figure
 from rille.pipeline.report.gather import Scene, facts_of, frames_of
 from rille.stages.core.quantities import count, metres, some, spans
 from rille.stages.geometry.pose_arrays import GROUND_PLANE, REFERENCE_PLANE
-from rille.stages.hazard.vehicle import DEFAULT_VEHICLE
 
 Rows = list[dict[str, Any]]
 Items = list[dict[str, str]]
@@ -304,21 +303,6 @@ def _vehicle(view: RunView) -> Items:
         "or by --set vehicle.track=1.2 and the like"
     )
     return [_item("vehicle", "No vehicle was stated", why)]
-
-
-def oversized(view: RunView) -> list[str]:
-    """State that the default vehicle is too long for any path on the map with its outline on known ground: in one line,
-    or none."""
-    risk, length = view.bundle(view.products.world_risk), 2.0 * DEFAULT_VEHICLE.half_length
-    if risk is None or view.config.vehicle != DEFAULT_VEHICLE:
-        return []
-    short, long = sorted(n * risk.meta["lattice"]["cell"] for n in risk["risk"].shape)
-    words = (
-        f"the vehicle is the {DEFAULT_VEHICLE.name}, {metres(length)} long, and the map {metres(long)} x "
-        f"{metres(short)}: no path keeps it on the map; state [vehicle] in the manifest, at the scale of the images"
-    )
-    # A path leads a length ahead, and half the vehicle is behind its start and before its end.
-    return [words] if long < 2.0 * length else []
 
 
 def _crosscheck_off(view: RunView) -> Items:

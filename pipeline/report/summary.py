@@ -112,7 +112,6 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
         _blurred(view)
         + _sensed_turns(view)
         + _verticals(view)
-        + delivery.oversized(view)
         + ([] if misread else _small_sigma(figures))
         + _displaced(view)
     )

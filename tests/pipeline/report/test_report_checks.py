@@ -22,8 +22,8 @@ from toys.finished import (
 )
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, summary
+from rille.pipeline.report.gather import compare
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams

@@ -271,18 +271,6 @@ def test_limits_that_nobody_stated_are_told(tmp_path, source, told):
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "rows", "told"), [({}, 199, 1), ({}, 201, 0), ({"track": 0.61}, 199, 0), ({"wheel_base": 3.0}, 199, 0)]
-)
-def test_a_default_vehicle_for_which_the_map_is_too_short_is_told_with_both_sizes(vehicle, rows, told):
-    risk = Bundle({"risk": np.zeros((90, rows), np.uint8)}, {"lattice": {"cell": 0.01}})
-    config, products = SimpleNamespace(vehicle=Vehicle(**vehicle)), SimpleNamespace(world_risk=0)
-    run = SimpleNamespace(config=config, products=products, bundle=lambda handle: risk)
-    lines = delivery.oversized(run)
-    assert len(lines) == told
-    assert all(" 1 m long" in line and "1.99 m x 0.900 m" in line for line in lines)
-
-
-@pytest.mark.parametrize(
     ("change", "told"), [({}, 1), ({"asked": 0.1}, 0), ({"observed": True}, 0), ({"freed": True}, 0)]
 )
 def test_a_turn_that_the_images_ask_for_but_cannot_tell_is_undecided(change, told):
