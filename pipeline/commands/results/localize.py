@@ -15,7 +15,7 @@ from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline import api
-from rille.pipeline.commands.results.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import RunTerrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
@@ -168,7 +168,7 @@ def localize(
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
     folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
-    around, terrain = area.around(), Terrain.of(folder)
+    around, terrain = area.around(), RunTerrain.of(folder)
     if ortho is not None:
         image, systems[str(ortho)] = read_ortho(ortho)
     if dem is not None:
@@ -205,7 +205,7 @@ def localize(
     return HOLES if why else COMPLETE
 
 
-def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Placement:
+def _found(terrain: RunTerrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Placement:
     """Place by the ortho images, if there is one; then by the elevations, if there are any.
 
     Raises

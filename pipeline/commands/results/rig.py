@@ -1,18 +1,12 @@
-"""``rille rig``: one rig from the matches of several runs, for manifests to pin.
-
-Each run repairs its rig by its own images, so that rigs of pieces of one log differ a little. Here the matches of all
-runs together decide which parameters depart from the calibration, and by how much, as those of all pairs do in a run.
-"""
+"""``rille rig``: one rig from the matches of several runs, for manifests to pin."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tomli_w
 
 from rille.datasets.text.reading import read_toml
@@ -22,31 +16,11 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.runs import lookup, options
 from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs
-from rille.stages.calibration.parameter_selection import Parameter, decide
-from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
+from rille.stages.calibration.joint_rig import Joint, disagreements, joint
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs
 from rille.stages.calibration.rig import RigParams
-from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError, warning
-from rille.stages.geometry.epipolar import NAMES, corrected
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Correction of a rig by the matches of one run: values and standard deviations (5,), radians."""
-
-    run: str
-    values: Floats
-    sigma: Floats
-
-
-@dataclass(frozen=True)
-class Joint:
-    """The rig of all runs, its parameters, and each run's own estimate."""
-
-    rig: Rig
-    parameters: tuple[Parameter, ...]
-    estimates: tuple[Estimate, ...]
 
 
 def rig(
@@ -91,45 +65,6 @@ def rig(
         warn(line)
     print(f"wrote        {output}\nnext         in the manifest of each sequence:")
     print(f'\n[rig]\nfile = "{output.resolve()}"')
-
-
-def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigParams) -> Joint:
-    """The rig of several runs: the given one, corrected where the matches of all together contradict it.
-
-    Parameters
-    ----------
-    matches : of each run, by its name.
-
-    Raises
-    ------
-    InputError
-        A run has no pair with enough matches.
-    """
-    empty = next((name for name, pairs in matches.items() if not pairs), None)
-    if empty is not None:
-        text = f"run {empty} has no pair with {MIN_MATCHES} matches"
-        raise InputError("RIL-030", text, remedy="leave it out, or choose more frames")
-    decision = decide(given, [pair for pairs in matches.values() for pair in pairs], params)
-    observed, priors = [p.observed for p in decision.parameters], params.priors(given)
-    estimates = []
-    for name, pairs in matches.items():
-        values, covariance, _ = solution(
-            adjust(given, pairs, observed, priors, rival=False), observed, priors, rival=False
-        )
-        estimates.append(Estimate(name, values[: len(NAMES)], np.sqrt(np.diag(covariance))[: len(NAMES)]))
-    return Joint(corrected(given, decision.correction), decision.parameters, tuple(estimates))
-
-
-def disagreements(found: Joint, significance: float) -> Iterator[str]:
-    """Lines on estimates of runs that differ from the joint one by more than ``significance`` standard deviations."""
-    for k, parameter in enumerate(found.parameters):
-        for one in found.estimates if parameter.observed else ():
-            off = one.values[k] - parameter.asked
-            away = abs(off) / one.sigma[k]
-            if away > significance:
-                turn = math.degrees(off)
-                text = f"{parameter.name.replace('_', ' ')} of run {one.run} is {turn:+.3f} degrees off the others"
-                yield warning("RIL-025", f"{text}, {away:.0f} standard deviations: did the rig move between them?")
 
 
 def _table(found: Joint) -> Iterator[str]:

@@ -25,13 +25,14 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.calibration.target import (
     LEAST_VIEWS,
-    MODELS,
     BoardView,
     RigCalibration,
     calibrate_rig,
+    doubts,
+    refuse_clutter,
     refuse_one_place,
 )
-from rille.stages.core.errors import InputError, told, warning
+from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
 
 Image = NDArray[Any]
@@ -107,13 +108,13 @@ def calibrate(
     boards = find_boards(pairs, given)
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
-    _refuse_clutter(rig, boards)
+    refuse_clutter(rig, boards.views, boards.corners)
     refuse_one_place(rig)
     atomic.write(output, _yaml(rig, boards, square))
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))
-    for line in doubts(rig, boards, model):
+    for line in doubts(rig, boards.views, boards.sizes, model):
         warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
 
@@ -171,52 +172,6 @@ def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | N
 def _distance(a: BoardView, b: BoardView) -> float:
     """RMS distance of the corners of two views, pixels, of the image in which they differ more."""
     return max(float(np.sqrt(((p - q) ** 2).sum(-1).mean())) for p, q in ((a.left, b.left), (a.right, b.right)))
-
-
-def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
-    columns, rows = boards.corners
-    grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
-    spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
-    # hundredths; at any resolution and distance.
-    if rig.rms > 0.1 * spacing:
-        text = f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS"
-        doubt = f"{spacing:.0f} px apart: no flat board, or not the same moment left and right"
-        remedy = "give pictures of a chessboard, and its inner corners, e.g. --corners 9x6"
-        raise InputError("RIL-800", f"{text}, {doubt}", remedy=remedy)
-
-
-def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:
-    """Share of an image within the convex hull of all corners."""
-    hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
-    return float(cv2.contourArea(hull)) / (size[0] * size[1])
-
-
-def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
-    """Reasons to doubt the result, one line each with its figure."""
-    # 1.0 px: a chessboard on paper leaves less.
-    if rig.rms > 1.0:
-        text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
-        yield warning("RIL-696", text)
-    used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
-    for side, size in zip(CAMERAS, boards.sizes, strict=True):
-        share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
-        # 0.01: all depths have this relative error.
-        if share > 0.01:
-            text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
-            yield warning("RIL-697", text)
-        seen = cover([getattr(view, side) for view in used], size)
-        # Beyond the corners, distortion is extrapolated.
-        if seen < 0.5:
-            text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
-            yield warning("RIL-698", text)
-        known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
-        vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
-        if vague:
-            # These views may determine a model with fewer terms.
-            fewer = "radtan" if model == "rational" else "radtan4"
-            text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
-            yield warning("RIL-699", text)
 
 
 def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:

@@ -12,8 +12,8 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.sequences.calibrate import Boards, _images, calibrate, cover, doubts
-from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
+from rille.pipeline.commands.sequences.calibrate import _images, calibrate
+from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual, cover, doubts
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -247,5 +247,5 @@ def test_views_that_are_left_out_cover_nothing():
     sigma = {f"{side} {name}": 0.0 for side in ("left", "right") for name in ("fx", *MODELS["radtan4"])}
     seen = tuple(ViewResidual(v.name, 0.1, 0.1, 0.1, used=v.name == "used") for v in views)
     found = RigCalibration(lens, lens, RigidTransform.identity(), dict.fromkeys(sigma, 1.0), sigma, 0.1, seen)
-    told = doubts(found, Boards((2, 2), ((100, 80), (100, 80)), views), "radtan4")
+    told = doubts(found, views, ((100, 80), (100, 80)), "radtan4")
     assert [line[:7] for line in told] == ["RIL-698", "RIL-698"]

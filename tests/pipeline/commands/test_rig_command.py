@@ -9,7 +9,8 @@ import pytest
 from raising import raises
 from rig_scenes import bed_depth, bed_rig, knocked, matches
 
-from rille.pipeline.commands.results.rig import _table, _toml, disagreements, joint, rig
+from rille.pipeline.commands.results.rig import _table, _toml, rig
+from rille.stages.calibration.joint_rig import disagreements, joint
 from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.epipolar import NAMES
 
