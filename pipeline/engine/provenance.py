@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from rille.pipeline.engine.plain import brief
-from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.pipeline.engine.runtime.atomic import read_hint, write_hint
 from rille.stages.core.errors import told
 
 if TYPE_CHECKING:

@@ -22,10 +22,9 @@ from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine import events, memory, progress
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.code_digest import remember
+from rille.pipeline.engine.dependencies import installed, remember
 from rille.pipeline.engine.failures import reason_of
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.packages import installed
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files

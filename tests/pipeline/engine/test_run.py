@@ -16,8 +16,8 @@ from toys.chain import build
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
+from rille.pipeline.engine import dependencies, progress, provenance
 from rille.pipeline.engine import events as ledger
-from rille.pipeline.engine import packages, progress, provenance
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
@@ -408,7 +408,7 @@ def test_manifest_says_where_a_result_comes_from(cache):
     assert about["params"] == {"offset": 0.0}
     assert about["inputs"] == {"values": graph.nodes[0].ref.digest}
     assert set(about["code"]) >= {"toys.scale", "toys.helper", "rille.stages.core.declare"}
-    assert about["env"] == {"numpy": packages.version("numpy")}
+    assert about["env"] == {"numpy": dependencies.version("numpy")}
     assert about["seconds"] >= 0
     assert about["peak_rss"] > 1e6
 

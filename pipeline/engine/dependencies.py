@@ -1,5 +1,4 @@
-"""What a stage's result depends on besides its inputs: its own source code (for packages:
-:mod:`rille.pipeline.engine.packages`).
+"""What a stage's result depends on besides its inputs: its own source code, and packages.
 
 The code digest of a module covers all *own* modules that it reaches by import statements, at any depth and also from
 within functions, with the ``__init__`` of every package on the way. Each counts as its syntax tree without
@@ -10,15 +9,24 @@ computed name are not seen, and neither are data files beside the code: keep tab
 
 A process reads a file once: it digests the source that it imported, even while somebody edits. Parsing all of them
 takes most of a second, so the findings are remembered by the bytes of each file (:func:`remember`).
+
+Packages are those that these modules import from elsewhere: found by the same walk, none can be forgotten. Each counts
+with its version and the kind of processor that it works for: NumPy, SciPy and OpenCV choose code for the processor that
+they find, and sums of floats that are added in another order round to other bits. (OpenBLAS by its core type, NumPy and
+OpenCV by the instruction sets in use; compiled kernels of numba add in the order in which they are written.)
 """
 
 from __future__ import annotations
 
 import ast
+import ctypes
 import hashlib
+import importlib.metadata
 import importlib.util
+import platform
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,8 +36,9 @@ from typing import NamedTuple
 from pydantic import TypeAdapter
 
 from rille.pipeline.engine.keys import digest
-from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.pipeline.engine.runtime.atomic import read_hint, write_hint
 from rille.pipeline.engine.runtime.private import private_folder
+from rille.stages.core.errors import RilleError
 
 OWN = ("rille.stages", "rille.datasets")
 
@@ -224,3 +233,94 @@ class _Strip(ast.NodeTransformer):
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         documents = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
         return None if documents else self.generic_visit(node)
+
+
+# -- packages ----------------------------------------------------------------------------------------------------------
+
+KNOWN = {
+    "cv2": ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python"),
+    "yaml": ("pyyaml",),
+    "PIL": ("pillow",),
+}
+"""Import name to the distributions that may give it, where they are named otherwise: looking it up takes 0.2 s."""
+
+NAMED = (
+    *("rille", "numpy", "numba", "scipy", "opencv-python-headless", "dask", "zarr", "rasterio", "pycolmap"),
+    *("matplotlib", "jinja2"),
+)
+"""Distributions that ``rille --version`` and reports name, and that workers of a cluster must share."""
+
+CORE_NAMES = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
+
+
+def versions(module: str) -> dict[str, str]:
+    """Version and kind of each distribution that a module and what it reaches import, by the distribution's name.
+
+    Raises
+    ------
+    RilleError
+        One of them is not installed.
+    """
+    # Left out: pydantic, which only checks parameters, whose values are in the key; the engine; and types.
+    names = external_imports(module) - frozenset({"pydantic", "rille", "typing_extensions"})
+    if "numba" in names:
+        names.add("llvmlite")  # generates the code
+    return dict(sorted(_version(name) for name in names))
+
+
+def installed() -> dict[str, str]:
+    """Versions for people: of Python and of :data:`NAMED`; no stage depends on this."""
+    return {name: importlib.metadata.version(name) for name in NAMED} | {"python": platform.python_version()}
+
+
+@cache
+def version(distribution: str) -> str:
+    """Exact installed version of a distribution, with the kind of processor that it works for, if that matters."""
+    found = importlib.metadata.version(distribution)
+    kind = _kind(distribution)
+    return f"{found} ({kind})" if kind else found
+
+
+@cache
+def _version(name: str) -> tuple[str, str]:
+    """Distribution that gives an import name, and its version."""
+    for distribution in KNOWN.get(name, (name,)):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            return distribution, version(distribution)
+    for distribution in _distributions().get(name, []):
+        return distribution, version(distribution)
+    raise RilleError("RIL-530", f"package {name} is not installed", remedy="run `make install`")
+
+
+_distributions = cache(importlib.metadata.packages_distributions)
+
+
+def _kind(distribution: str) -> str:
+    if distribution == "numpy":
+        import numpy as np
+
+        found = np.show_config(mode="dicts")["SIMD Extensions"]
+        return " ".join([*found.get("baseline", ()), *found.get("found", ()), _blas("numpy")]).strip()
+    if distribution == "scipy":
+        return _blas("scipy")
+    if distribution in KNOWN["cv2"]:
+        import cv2
+
+        return " ".join(word.lstrip("*") for word in cv2.getCPUFeaturesLine().split() if not word.endswith("?"))
+    return ""
+
+
+def _blas(package: str) -> str:
+    """Core type that the OpenBLAS of a package has chosen; empty where it brings none."""
+    spec = importlib.util.find_spec(package)
+    for root in map(Path, (spec and spec.submodule_search_locations) or ()):
+        for path in (*root.parent.glob(f"{package}.libs/*openblas*"), *root.glob(".dylibs/*openblas*")):
+            # Asked of the library itself: the choice depends on the processor and OPENBLAS_CORETYPE, and no package
+            # tells it.
+            library = ctypes.CDLL(str(path))  # the one that the package has loaded, or will
+            for name in CORE_NAMES:
+                if hasattr(library, name):
+                    function = getattr(library, name)
+                    function.restype = ctypes.c_char_p
+                    return f"OpenBLAS {(function() or b'').decode(errors='replace')}"
+    return ""
