@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, artifact, by_frame
+from rille.pipeline.export.view import RUN, RunView, artifact, by_frame
 from rille.pipeline.export.writers import FRAME, WORLDS, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
@@ -49,13 +49,7 @@ def crosscheck_poses(view: RunView, agreement: Bundle) -> Floats:
     return poses
 
 
-def _posed(run: RunView) -> tuple[object, ...]:
-    return (run.products.trajectory,)
-
-
-def _times(run: RunView) -> tuple[object, ...]:
-    return (run.sequence.times,)
-
+POSED, TIMES = (RUN.products.trajectory,), (RUN.sequence.times,)
 
 OUTPUTS = (
     Output(
@@ -64,7 +58,7 @@ OUTPUTS = (
         "evo (evo_traj kitti), any text editor",
         lambda path, run: write_trajectory_kitti(path, world_poses(_trajectory(run))),
         "world",
-        _posed,
+        POSED,
     ),
     Output(
         "trajectory.tum",
@@ -72,16 +66,16 @@ OUTPUTS = (
         "evo (evo_traj tum), CloudCompare",
         lambda path, run: _write_tum(path, run, world_poses(_trajectory(run))),
         "world",
-        _posed,
-        _times,
+        POSED,
+        TIMES,
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        needs=_posed,
-        reads=_times,
+        needs=POSED,
+        reads=TIMES,
     ),
     Output(
         "crosscheck.tum",
@@ -89,8 +83,8 @@ OUTPUTS = (
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
         lambda path, run: _write_tum(path, run, crosscheck_poses(run, artifact(run, run.products.agreement))),
         "world",
-        lambda run: (run.products.agreement, run.products.trajectory),
-        _times,
+        (RUN.products.agreement, *POSED),
+        TIMES,
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

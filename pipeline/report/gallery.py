@@ -9,7 +9,7 @@ import numpy as np
 
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import Reads, RunView
+from rille.pipeline.export.view import RUN, Names, RunView
 from rille.pipeline.report import canvas, figures, gather, ranges, strips, tables, terrain_map
 from rille.pipeline.report.canvas import FIGURE, Block, Figure
 from rille.pipeline.report.figures import Curve, Plot
@@ -116,7 +116,7 @@ def draw(title: str, maker: Maker, view: RunView) -> Figure:
         return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}")
 
 
-def _drawing(title: str, maker: Maker, reads: Reads) -> Output:
+def _drawing(title: str, maker: Maker, reads: Names) -> Output:
     """Row of a figure: a part of the page, kept as JSON."""
 
     def write(path: Path, run: RunView) -> None:
@@ -125,34 +125,28 @@ def _drawing(title: str, maker: Maker, reads: Reads) -> Output:
     return Output(title, "", "", write, reads=reads)
 
 
-def _of_map(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    drawn = p.world_tiles, p.world_risk, p.world_path, p.drive, p.disparity, p.accuracy, run.config.vehicle
-    return *drawn, *colour.reads(run)
-
-
-def _of_stops(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    return p.disparity, p.images, p.local_dem, p.local_risk, p.local_path, run.sequence.rig
-
-
-def _of_trajectory(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy
-
+OF_MAP = (
+    *(RUN.products.world_tiles, RUN.products.world_risk, RUN.products.world_path, RUN.products.drive),
+    *(RUN.products.disparity, RUN.products.accuracy, RUN.config.vehicle, *colour.READS),
+)
+OF_STOPS = (
+    *(RUN.products.disparity, RUN.products.images, RUN.products.local_dem, RUN.products.local_risk),
+    *(RUN.products.local_path, RUN.sequence.rig),
+)
+OF_TRAJECTORY = (
+    *(RUN.products.trajectory, RUN.products.agreement),
+    *(RUN.products.accuracy, RUN.products.crosscheck_accuracy),
+)
+OF_DRIVE = (RUN.products.drive, RUN.products.images, RUN.products.trajectory, RUN.products.accuracy)
 
 OUTPUTS = (
-    _drawing("Map", terrain_map.block, _of_map),
-    _drawing(
-        "Drive",
-        strips.drive,
-        lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.products.accuracy),
-    ),
-    _drawing("Stops", strips.pairs, _of_stops),
-    _drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
-    _drawing("Trajectory", _trajectory, _of_trajectory),
-    _drawing("Pairs", _pairs, lambda run: tables.of_pairs(run.products)),
-    _drawing("Elevation error", _elevation_error, lambda run: (run.products.dem_accuracy,)),
+    _drawing("Map", terrain_map.block, OF_MAP),
+    _drawing("Drive", strips.drive, OF_DRIVE),
+    _drawing("Stops", strips.pairs, OF_STOPS),
+    _drawing("Rig", _rig, (RUN.products.rigs, RUN.products.orientations, RUN.sequence.rig)),
+    _drawing("Trajectory", _trajectory, OF_TRAJECTORY),
+    _drawing("Pairs", _pairs, tables.OF_PAIRS),
+    _drawing("Elevation error", _elevation_error, (RUN.products.dem_accuracy,)),
 )
-"""All figures of the page; the template places them."""
+"""All figures of the page, each with what it reads of a run; the template places them."""
 STAGE = stage("output.figures", "Figures of the report", OUTPUTS)
