@@ -87,11 +87,11 @@ class Maybe:
 
 
 class Waiting(NamedTuple):
-    """A flow that waits for handles: ``go_on`` takes their references, with ``holes`` None of those that failed."""
+    """A flow that waits for handles: ``go_on`` takes their references, None of those that failed; None: it never goes
+    on."""
 
     handles: list[Handle]
-    go_on: Callable[..., None]
-    holes: bool
+    go_on: Callable[..., None] | None
 
 
 class Complete(frozenset[str]):
@@ -218,7 +218,7 @@ class Graph:
             wanted = None
         except MissingError as error:
             # The flow never goes on; the end of the run names the tasks that it waited for.
-            self.waiting.append(Waiting(error.handles, lambda *_: None, holes=False))
+            self.waiting.append(Waiting(error.handles, None))
             return
         if wanted is None:
             return
@@ -233,7 +233,7 @@ class Graph:
             else:
                 self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        self.waiting.append(Waiting(handles, resume, holes=True))
+        self.waiting.append(Waiting(handles, resume))
 
 
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:

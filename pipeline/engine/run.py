@@ -25,7 +25,7 @@ import heapq
 import math
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from typing import Any
 from rille.pipeline.engine import memory, provenance
 from rille.pipeline.engine.events import Ledger
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Graph, Handle, Waiting
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.store.arrays import DamagedError
@@ -427,10 +427,10 @@ class _Run:
         if self.stopped or self.suspects:
             return False
         for i, waiting in enumerate(self.graph.waiting):
-            lost = ("failed", "skipped") if waiting.holes else ()
-            if all(h.done or h.earlier or h.status in lost for h in waiting.handles):
+            known = all(h.done or h.earlier or h.status in ("failed", "skipped") for h in waiting.handles)
+            if waiting.go_on is not None and known:
                 del self.graph.waiting[i]
-                self._expand(waiting)
+                self._expand(waiting.handles, waiting.go_on)
                 self._mark_needed()
                 return True
         last = self.graph.last
@@ -441,18 +441,18 @@ class _Run:
         self._mark_needed()
         return True
 
-    def _expand(self, waiting: Waiting) -> None:
-        assumed = [h.label for h in waiting.handles if h.earlier and not h.done]
+    def _expand(self, handles: list[Handle], go_on: Callable[..., None]) -> None:
+        assumed = [h.label for h in handles if h.earlier and not h.done]
         self.result.assumed += assumed
         try:
-            waiting.go_on(*(h.ref or h.earlier for h in waiting.handles))
+            go_on(*(h.ref or h.earlier for h in handles))
         except BrokenPipeError:  # the reader of the flow's output closed it
             raise
         except Exception as error:
             if assumed:  # assumed results of other parameters or images do not fit: the rest is unknown
                 self.result.unknown += assumed
             else:
-                label = f"plan after {_labels(waiting.handles)}"
+                label = f"plan after {_labels(handles)}"
                 self.ledger.note(label, "failed", f"{type(error).__name__}: {error}")
                 self._failed(Failure(label, "", error))
 

@@ -10,11 +10,10 @@ import numpy as np
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.view import RUN, Names, RunView
-from rille.pipeline.report import canvas, figures, gather, ranges, strips, tables, terrain_map
-from rille.pipeline.report.canvas import FIGURE, Block, Figure
+from rille.pipeline.report import canvas, figures, gather, strips, tables, terrain_map
+from rille.pipeline.report.canvas import FIGURE, Block, Figure, spread
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.ranges import spread
 from rille.stages.core.errors import RilleError
 
 Maker = Callable[[Scene], Block | None]
@@ -85,7 +84,7 @@ def _rig(scene: Scene) -> Block | None:
     calibration, left = scene.calibration, scene.view.sequence.rig.left
     if calibration is None or not len(calibration.before):
         return None
-    bound = max(0.3, ranges.limits(np.abs(calibration.before), 0, 99)[1])
+    bound = max(0.3, canvas.limits(np.abs(calibration.before), 0, 99)[1])
     panels = []
     for name, values in (("given", calibration.before), ("used", calibration.after))[: 1 + calibration.changed]:
         label, alt = f"distance from epipolar line, px: {name} rig", f"Residuals, {name} rig: {spread(values)} px"
@@ -101,7 +100,7 @@ def _elevation_error(scene: Scene) -> Block | None:
         return None
     factor, unit = figures.metres_or_mm(error.arrays["error"])
     values = error.arrays["error"] * factor
-    alt, bound = f"Elevation minus truth, {spread(values)} {unit}", ranges.limits(np.abs(values), 0, 97)[1]
+    alt, bound = f"Elevation minus truth, {spread(values)} {unit}", canvas.limits(np.abs(values), 0, 97)[1]
     label = f"elevation minus truth, {unit}"
     return Block((figures.raster(values, label, alt, extent=error.lattice.bounds, bound=bound),))
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from rille.datasets.images.files import sound
 from rille.datasets.protocol import CAMERAS, Sequence
-from rille.pipeline.commands import batch
+from rille.pipeline.commands import complaints
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store, StoreError
@@ -51,7 +51,7 @@ def check(seq: str, *more: str, options: Settings = Settings()) -> int:
     """
     if not more:
         return _check(seq, options)
-    return batch.each((seq, *more), lambda name: (_check(name, options), ""), keep_going=True)[0]
+    return complaints.each((seq, *more), lambda name: (_check(name, options), ""), keep_going=True)[0]
 
 
 def _check(seq: str, options: Settings) -> int:
