@@ -1,4 +1,4 @@
-"""Terrains of several runs of one place as one, in the world frame of the first.
+"""Terrain of a run in a larger map; and terrains of several runs of one place as one, in the world of the first.
 
 A run is laid on the first one by the georeferences of both, or else by ortho images or relief
 (:mod:`rille.stages.evaluation.place`); then elevations decide, with standard deviations, which those of the merged
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,24 @@ from rille.stages.core.errors import DegenerateError, InputError, warning
 from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_comparison
 from rille.stages.evaluation.dem_comparison import Alignment
-from rille.stages.evaluation.place import register
-from rille.stages.geometry.geometry import RigidTransform, rotation_log
+from rille.stages.evaluation.place import place, register
+from rille.stages.geometry.geometry import RigidTransform, from_above, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.map_localization import Placement, independent_cells
+from rille.stages.terrain.map_localization import (
+    MapLocalizationParams,
+    Placement,
+    SearchArea,
+    fix,
+    independent_cells,
+)
 from rille.stages.terrain.merge import EXACT, Merged, MergeParams, ModelLayer, Placed, merge
 from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.shading import gradient
+
+TURN_DEG = 20.0
+"""Degrees to either side of a given heading that are searched."""
+
+NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,56 @@ class Terrain:
     def image(self) -> Grid:
         """The ortho image in the world frame."""
         return Grid.on(self.lattice, self.arrays["ortho"])
+
+
+def locate(
+    terrain: Terrain, image: Grid | None, heights: Grid | None, around: SearchArea | None, sigma_tilt_deg: float
+) -> tuple[Placement, str]:
+    """Placement of a run in a larger map, by its ortho ``image``, if there is one, then by its ``heights``, if there
+    are any; and a doubt, empty if there is none.
+
+    Parameters
+    ----------
+    around : searched part of the map; None: all of it.
+    sigma_tilt_deg : standard deviation of the vertical of the run about each axis, degrees.
+
+    Raises
+    ------
+    DegenerateError
+        They do not determine the place.
+    """
+    by_image, doubt = None, ""
+    if image is not None:
+        if around is not None and around.distance < math.inf:
+            away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
+            near = away <= around.distance + terrain.lattice.radius
+            image = replace(image, values=np.where(near, image.values, np.nan))
+        try:
+            by_image = place(terrain.image, image)
+        except DegenerateError as error:
+            if heights is None:
+                raise
+            doubt = f"{error.code}: {error}; by the elevations alone"
+    if heights is None:
+        assert by_image is not None
+        return by_image, doubt
+    if by_image is not None:
+        # Elevations and ortho images must agree on a place within ten cells of the map.
+        around = SearchArea(*from_above(by_image.pose), 10.0 * heights.cell, math.radians(TURN_DEG))
+    params = MapLocalizationParams.model_validate({"sigma_tilt_deg": sigma_tilt_deg})
+    found = fix(terrain.grid, heights, around, params)
+    figures = found.figures if by_image is None else {**found.figures, **by_image.figures}
+    return replace(found, figures=figures), doubt
+
+
+def numbers(placed: Placement) -> dict[str, tuple[float, float]]:
+    """Known numbers of a place by name, with standard deviations: position, tilts about the map's axes, yaw."""
+    R, sigma = placed.pose.rotation, np.sqrt(np.diag(placed.covariance))
+    heading = heading_of(placed.pose)
+    tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
+    values = *placed.pose.translation, *tilts, math.degrees(heading)
+    sigmas = *sigma[:3], *np.degrees(sigma[3:])
+    return {name: (float(v), float(s)) for name, v, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf}
 
 
 @dataclass(frozen=True)
