@@ -12,7 +12,8 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.sequences.calibrate import _images, calibrate
+from rille.datasets.images.boards import images_of
+from rille.pipeline.commands.sequences.calibrate import calibrate
 from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual, cover, doubts
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -175,7 +176,7 @@ def test_complaints_say_what_to_change(tmp_path):
 def test_hidden_files_beside_the_pictures_are_passed_over(tmp_path):
     folder = images(tmp_path / "a[1]")
     (folder / "._left0.png").touch()
-    assert [path.name for path in _images(folder)] == ["left0.png", "left1.png", "right0.png", "right1.png"]
+    assert [path.name for path in images_of(folder)] == ["left0.png", "left1.png", "right0.png", "right1.png"]
 
 
 @pytest.mark.data
