@@ -53,7 +53,7 @@ def _versions() -> str:
     """Version of the program, of what its results depend on, and the machine's kind; one a line."""
     import platform
 
-    from rille.pipeline.engine.dependencies import installed
+    from rille.pipeline.engine.keys import installed
 
     versions = installed() | {"system": f"{platform.system()} {platform.machine()}"}
     return "\n".join(f"{name:24s} {version}" for name, version in versions.items())

@@ -40,7 +40,7 @@ from rille.datasets.protocol import CAMERAS, Sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import prepare_environment
-from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
+from rille.pipeline.engine.store.arrays import DIMS, coordinates, lattice_of
 from rille.pipeline.engine.task import map_ports
 from rille.pipeline.flow import config
 from rille.stages.core.declare import AnyArray, Array, Bundle, Stage

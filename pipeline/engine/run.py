@@ -1,6 +1,6 @@
 """Run a graph: look its tasks up in the cache, give the others to workers, continue its flows as results arrive.
 
->>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
+>>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=events.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
 >>> result.counts["cached"]
 8
@@ -31,10 +31,9 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import memory, provenance
-from rille.pipeline.engine.events import Ledger
+from rille.pipeline.engine.events import Ledger, Progress
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Graph, Handle
-from rille.pipeline.engine.progress import Progress
 from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic

@@ -22,8 +22,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rille.pipeline.engine.dependencies import module_digests, versions
-from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.keys import digest, module_digests, versions
 from rille.pipeline.engine.runtime.kernels import COMPILING, use_own_folder
 from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.engine.store.base import Store

@@ -20,11 +20,11 @@ from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
-from rille.pipeline.engine import events, memory, progress
+from rille.pipeline.engine import events, memory
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.dependencies import installed, remember
 from rille.pipeline.engine.failures import reason_of
 from rille.pipeline.engine.graph import Graph
+from rille.pipeline.engine.keys import installed, remember
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
@@ -269,7 +269,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / LEDGER,
-            progress=progress.make("quiet" if options.quiet else options.progress),
+            progress=events.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             kept=kept,
         ),

@@ -19,7 +19,7 @@ from toys.browser import Browser
 import rille
 from rille.pipeline import api, steps
 from rille.pipeline.cli import main
-from rille.pipeline.engine import dependencies, events
+from rille.pipeline.engine import events, keys
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.runs.options import Options
 from rille.stages.core.errors import ConfigError
@@ -217,7 +217,7 @@ def test_its_examples_run() -> None:
 
 
 def test_no_stage_of_the_package_depends_on_it() -> None:
-    assert "rille.pipeline" in (found := dependencies.module_digests("rille.pipeline.engine.plain"))
+    assert "rille.pipeline" in (found := keys.module_digests("rille.pipeline.engine.plain"))
     assert "rille.pipeline.api" not in found
 
 

@@ -7,6 +7,11 @@ The group is written once. Chunks are lz4-compressed with byte shuffle; ``dimens
 are set, so ``xarray.open_zarr`` reads an artifact as it is. Members of a family (``level_*``) differ in size, so their
 dimensions are told apart by the suffix (``row_0``, ``row_1`` ...).
 
+An array (row, col) on the lattice that the metadata state has coordinates beside it, ``x`` (col) and ``y`` (row),
+metres, of the cell centres, so that xarray knows where each cell is. Arrays of image pixels need none: pixel centres
+are at integer (row, col), which is what xarray counts by itself. Coordinates follow from the metadata: they are no
+outputs, and enter no digest.
+
 Each array is read at its first access; the CRC-32 of each member is compared at every reading.
 """
 
@@ -24,14 +29,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rille.pipeline.engine.keys import digest
-from rille.pipeline.engine.store import cf_coordinates
 from rille.pipeline.engine.store.artifact import Archive, BrokenError, Manifest
-from rille.pipeline.engine.store.cf_coordinates import Variable
 from rille.stages.core.declare import AnyArray, Bundle, Stage
 from rille.stages.core.errors import RilleError
+from rille.stages.geometry.lattice import Lattice
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.store.base import Store
+
+DIMS = ["row", "col"]
+
+Variable = tuple[AnyArray, list[str], dict[str, str]]
+"""Values, names of the dimensions, and attributes."""
 
 CHUNK = 1024
 """Chunk edge, cells; an array of at most its square (4 MB of float32) is one chunk, whatever its shape."""
@@ -75,7 +84,7 @@ def encode(stage: Stage, bundle: Bundle) -> tuple[dict[str, bytes], dict[str, An
         name: {"dtype": values.dtype.str, "shape": list(values.shape), "chunks": list(_edges(values.shape))}
         for name, (values, _, _) in variables.items()
     }
-    variables |= cf_coordinates.located(variables, bundle.meta)
+    variables |= located(variables, bundle.meta)
     nodes = {name: _node(*variable) for name, variable in variables.items()}
     source = f"Rille, stage {stage.name}: {stage.summary}"
     group = {
@@ -155,6 +164,33 @@ def _edges(shape: tuple[int, ...]) -> tuple[int, ...]:
         longest = max(shape)
         return tuple(n if n < longest else max(CHUNK**2 // (math.prod(shape) // n), 1) for n in shape)
     return tuple(min(n, CHUNK) for n in shape)
+
+
+def lattice_of(meta: Mapping[str, Any]) -> Lattice | None:
+    """The lattice that an artifact's arrays lie on, if its metadata state one."""
+    stated = meta.get("lattice")
+    keys = {"x0", "y0", "cell", "rows", "cols"}
+    return Lattice.from_dict(stated) if isinstance(stated, Mapping) and keys <= stated.keys() else None
+
+
+def coordinates(lattice: Lattice, frame: str) -> dict[str, Variable]:
+    """Values, dimensions and attributes of the coordinates by name."""
+    common = {"units": "m", "frame": frame}
+    return {
+        "x": (lattice.xs(), ["col"], {**common, "long_name": "x of the cell centre (right)"}),
+        "y": (lattice.ys(), ["row"], {**common, "long_name": "y of the cell centre (ahead)"}),
+    }
+
+
+def located(variables: Mapping[str, Variable], meta: Mapping[str, Any]) -> dict[str, Variable]:
+    """The arrays of an artifact, which name their coordinates and standard deviations, and these coordinates."""
+    lattice, named = lattice_of(meta), dict[str, Variable]()
+    for name, (values, dims, attributes) in variables.items():
+        on_lattice = lattice is not None and dims == DIMS and values.shape == lattice.shape
+        names = {"coordinates": "x y"} if on_lattice else {}
+        names |= {"ancillary_variables": f"{name}_std"} if f"{name}_std" in variables else {}
+        named[name] = values, dims, {**attributes, **names}
+    return named | (coordinates(lattice, str(meta.get("frame", ""))) if lattice is not None and variables else {})
 
 
 class DamagedError(RilleError):

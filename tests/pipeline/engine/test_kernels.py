@@ -17,7 +17,7 @@ import numba.core.caching
 import pytest
 from toys.numbers import NumbersParams
 
-from rille.pipeline.engine import progress
+from rille.pipeline.engine import events
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.runtime.kernels import Compiling, Locator
@@ -174,7 +174,7 @@ def test_of_several_processes_one_compiles(checkout):
 
 def test_a_run_says_what_it_compiled():
     stream = io.StringIO()
-    shown = progress.Lines(stream)
+    shown = events.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
     shown.open()
     shown.resolved(handle, 2, Took())

@@ -16,7 +16,7 @@ from toys.chain import build
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from rille.pipeline.engine import dependencies, progress, provenance
+from rille.pipeline.engine import events, keys, provenance
 from rille.pipeline.engine import events as ledger
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
@@ -408,7 +408,7 @@ def test_manifest_says_where_a_result_comes_from(cache):
     assert about["params"] == {"offset": 0.0}
     assert about["inputs"] == {"values": graph.nodes[0].ref.digest}
     assert set(about["code"]) >= {"toys.scale", "toys.helper", "rille.stages.core.declare"}
-    assert about["env"] == {"numpy": dependencies.version("numpy")}
+    assert about["env"] == {"numpy": keys.version("numpy")}
     assert about["seconds"] >= 0
     assert about["peak_rss"] > 1e6
 
@@ -439,7 +439,7 @@ def test_arguments_without_canonical_form_are_named(cache):
 
 
 def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
-    shown = progress.Progress()
+    shown = events.Progress()
     shown.close = lambda: setattr(shown, "closed", True)
     with pytest.raises(OSError, match="/dev/full"):
         run(cache, make=mischief("fine"), ledger=Path("/dev/full"), progress=shown)
@@ -448,9 +448,9 @@ def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
 
 @pytest.mark.parametrize("mode", ["plain", "quiet", "bar"])
 def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    monkeypatch.setattr(events, "INTERVAL", 0.0)
     stream = io.StringIO()
-    run(cache, make=mischief("fine", "value"), progress=progress.make(mode, stream))
+    run(cache, make=mischief("fine", "value"), progress=events.make(mode, stream))
     text = stream.getvalue()
     if mode == "quiet":
         assert text == ""
