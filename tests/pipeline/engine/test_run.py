@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import signal
+import sys
 import time
 import traceback
 from collections import Counter
@@ -17,7 +18,6 @@ from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
 from rille.pipeline.engine import events, keys, provenance
-from rille.pipeline.engine import events as ledger
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
@@ -149,7 +149,7 @@ def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path
         ledger=tmp_path / "ledger.jsonl",
     )
     assert [f.label for f in result.failures] == ["first"]
-    told = {row["label"]: (row["status"], row["reason"]) for row in ledger.read(tmp_path / "ledger.jsonl")}
+    told = {row["label"]: (row["status"], row["reason"]) for row in events.read(tmp_path / "ledger.jsonl")}
     assert told.pop("first")[0] == "failed"
     by = {"second": "first failed", "last": "second was skipped", "rest": "last was skipped"}
     assert told == {label: ("skipped", reason) for label, reason in by.items()}
@@ -173,7 +173,7 @@ def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, t
     graph, result = run(cache, make=in_a_row("first", "last"), ledger=tmp_path / "ledger.jsonl")
     assert result.ok
     assert statuses(graph) == {"first": "cached", "last": "computed"}
-    assert [row["label"] for row in ledger.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"
+    assert [row["label"] for row in events.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"
 
 
 def test_dry_run_computes_nothing_and_explains(cache):
@@ -236,7 +236,7 @@ def test_without_keep_going_nothing_new_is_begun(cache, tmp_path):
         ("value/after", "value/third", "fine", "fine/after", "fine/third"), "skipped"
     )
     assert not result.ok
-    rows = {r["label"]: r for r in ledger.read(tmp_path / "ledger.jsonl")}
+    rows = {r["label"]: r for r in events.read(tmp_path / "ledger.jsonl")}
     assert rows["value"]["error"] == {"type": "ValueError", "message": "negative depth"}
     assert rows["value/after"]["reason"] == "value failed"
     assert rows["value/third"]["reason"] == "value/after was skipped"
@@ -248,7 +248,7 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
     graph, result = run(cache, make=mischief("value", "degenerate", "fine"), keep_going=True, ledger=file)
     assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
     assert (result.counts["computed"], result.counts["failed"], result.counts["skipped"]) == (3, 2, 4)
-    rows = ledger.read(file)
+    rows = events.read(file)
     assert sorted(r["label"] for r in rows) == sorted(h.label for h in graph.nodes)
     assert {r["key"] for r in rows if r["status"] == "computed"} == {h.key for h in graph.nodes if h.done}
     assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
@@ -313,7 +313,7 @@ def test_a_flow_that_fails_is_a_failure_and_one_that_cannot_go_on_is_noted(cache
 
     _, result = run(cache, make=make, keep_going=True, ledger=tmp_path / "l")
     assert [f.label for f in result.failures] == ["plan after n", "value"]
-    assert ledger.read(tmp_path / "l")[-1] == {
+    assert events.read(tmp_path / "l")[-1] == {
         "label": "plan after value",
         "stage": "",
         "status": "skipped",
@@ -350,7 +350,7 @@ def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, 
 
     with pytest.raises(KeyboardInterrupt):
         run(cache, make=make, ledger=tmp_path / "ledger.jsonl")
-    assert "ok" not in ledger.facts(tmp_path / "ledger.jsonl"), "it did not come to its end"
+    assert "ok" not in events.facts(tmp_path / "ledger.jsonl"), "it did not come to its end"
     assert [node.status for node in done] == ["pending"], "the flow went on, the run did not"
     assert capfd.readouterr().err == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -367,7 +367,7 @@ def test_what_was_created_first_runs_first(cache, tmp_path):
             graph.node("toys.numbers", label, NumbersParams(), {"frame": frame})
 
     run(cache, make=make, ledger=tmp_path / "l")
-    assert [row["label"] for row in ledger.read(tmp_path / "l")] == ["a", "b", "c", "d"]
+    assert [row["label"] for row in events.read(tmp_path / "l")] == ["a", "b", "c", "d"]
 
 
 def test_a_miss_is_explained_against_the_most_similar_artifact(cache):
@@ -462,3 +462,21 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
 def test_no_workers_are_refused(cache):
     with raises("RIL-540"):
         run(cache, jobs=0)
+
+
+def test_a_task_passes_few_modules_from_the_graph_to_its_artifact(cache):
+    """Whoever follows a task reads these: a new station needs a reason."""
+    graph, passed, room = Graph(), set(), f"{Path(driver.__file__).parent}/"
+
+    def note(frame, event, _):
+        if event == "call" and frame.f_code.co_filename.startswith(room) and frame.f_code.co_name != "<module>":
+            passed.add(frame.f_code.co_filename.removeprefix(room))
+
+    build(graph)
+    sys.setprofile(note)
+    try:
+        driver.run(graph, Store(cache), driver.RunOptions(executor="inline")).check()
+    finally:
+        sys.setprofile(None)
+    assert {"run.py", "task.py", "store/base.py"} <= passed
+    assert len(passed) <= 15, sorted(passed)
