@@ -23,13 +23,7 @@ from rille.stages.evaluation.dem_comparison import Alignment
 from rille.stages.evaluation.place import place, register
 from rille.stages.geometry.geometry import RigidTransform, from_above, heading_of, rotation_exp, rotation_log
 from rille.stages.geometry.lattice import Lattice, union
-from rille.stages.terrain.map_localization import (
-    MapLocalizationParams,
-    Placement,
-    SearchArea,
-    fix,
-    independent_cells,
-)
+from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix, independent_cells
 from rille.stages.terrain.merge import EXACT, Merged, MergeParams, ModelLayer, Placed, merge
 from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.shading import gradient

@@ -20,13 +20,7 @@ from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import (
-    crs_name,
-    frames_of,
-    read_elevation,
-    read_ortho,
-    refuse_unlike_systems,
-)
+from rille.pipeline.export.read_dem import crs_name, frames_of, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, write_json, write_trajectory_tum
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file

@@ -18,13 +18,7 @@ from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
-from rille.stages.calibration.target import (
-    RigCalibration,
-    calibrate_rig,
-    doubts,
-    refuse_clutter,
-    refuse_one_place,
-)
+from rille.stages.calibration.target import RigCalibration, calibrate_rig, doubts, refuse_clutter, refuse_one_place
 from rille.stages.core.errors import InputError
 
 

@@ -9,17 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toys.finished import (
-    BASIC,
-    FRAMES,
-    Written,
-    bundles,
-    checked,
-    checks,
-    products,
-    view,
-    written,
-)
+from toys.finished import BASIC, FRAMES, Written, bundles, checked, checks, products, view, written
 
 from rille.datasets.georeference import Georeference
 from rille.pipeline.report import figures, summary
