@@ -8,7 +8,7 @@ terrain contain.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -58,22 +58,28 @@ class Terrain:
 
 
 def locate(
-    terrain: Terrain, image: Grid | None, heights: Grid | None, around: SearchArea | None, sigma_tilt_deg: float
-) -> tuple[Placement, str]:
+    terrain: Terrain,
+    image: Grid | None,
+    heights: Grid | None,
+    around: SearchArea | None,
+    sigma_tilt_deg: float,
+    tell: Callable[[str], None],
+) -> Placement:
     """Placement of a run in a larger map, by its ortho ``image``, if there is one, then by its ``heights``, if there
-    are any; and a doubt, empty if there is none.
+    are any.
 
     Parameters
     ----------
     around : searched part of the map; None: all of it.
     sigma_tilt_deg : standard deviation of the vertical of the run about each axis, degrees.
+    tell : takes a line on an image that does not determine the place.
 
     Raises
     ------
     DegenerateError
         They do not determine the place.
     """
-    by_image, doubt = None, ""
+    by_image = None
     if image is not None:
         if around is not None and around.distance < math.inf:
             away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
@@ -84,17 +90,16 @@ def locate(
         except DegenerateError as error:
             if heights is None:
                 raise
-            doubt = f"{error.code}: {error}; by the elevations alone"
+            tell(f"{error.code}: {error}; by the elevations alone")
     if heights is None:
         assert by_image is not None
-        return by_image, doubt
+        return by_image
     if by_image is not None:
         # Elevations and ortho images must agree on a place within ten cells of the map.
         around = SearchArea(*from_above(by_image.pose), 10.0 * heights.cell, math.radians(TURN_DEG))
     params = MapLocalizationParams.model_validate({"sigma_tilt_deg": sigma_tilt_deg})
     found = fix(terrain.grid, heights, around, params)
-    figures = found.figures if by_image is None else {**found.figures, **by_image.figures}
-    return replace(found, figures=figures), doubt
+    return found if by_image is None else replace(found, figures={**found.figures, **by_image.figures})
 
 
 def numbers(placed: Placement) -> dict[str, tuple[float, float]]:

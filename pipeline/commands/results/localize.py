@@ -161,9 +161,7 @@ def localize(
     try:
         # Standard deviation, degrees, of a vertical by a sensor, and of one by the ground.
         tilt = 0.5 if terrain.vertical == "attitude" else 5.0
-        found, doubt = locate(terrain, image, None if model is None else model.grid, around, tilt)
-        if doubt:
-            warn(doubt)
+        found = locate(terrain, image, None if model is None else model.grid, around, tilt, warn)
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
