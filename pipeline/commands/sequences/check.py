@@ -200,17 +200,17 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
         self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
-        if len(left) and not exchanged:
-            beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
-            self.say(judge.judge_sides(float(beyond.mean())))
         self.say(None if exchanged else judge.judge_epipolar(oriented.meta))
         self.say(judge.judge_repetition(oriented.meta["repeated"]))
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
-        if fitted.ref is None and not exchanged:
+        if not exchanged and fitted.ref is None:  # as when matches lie beyond infinity
             self.refused(_cause(fitted), "rig")
-        elif fitted.ref is not None and "misread" in fitted.ref.meta:
+        elif not exchanged and len(left):
+            beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
+            self.say(judge.judge_sides(float(beyond.mean())))
+        if fitted.ref is not None and "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 

@@ -105,6 +105,15 @@ def test_swapped_folders_fail(tmp_path, capsys, monkeypatch):
     assert [text.split()[:2] for text in lines if text.startswith("FAIL")] == [["FAIL", "sides"]]  # one fault, one line
 
 
+def test_matches_beyond_infinity_are_one_fault_and_one_line(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    k = "200 0 {} {} 0 200 59.5 0 0 0 1 0\n"
+    (path / "calib.txt").write_text(k.format(99.5, 0) + k.format(79.5, -200 * 0.16))
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert [text.split()[:3] for text in lines if text.startswith("FAIL")] == [["FAIL", "rig", "RIL-772:"]]
+
+
 def test_a_first_pair_whose_sides_are_exchanged_is_named_and_another_is_matched(tmp_path, capsys):
     path = folder(tmp_path / "wall")
     left, right = path / "left" / "000.png", path / "right" / "000.png"
