@@ -124,28 +124,21 @@ def _drawing(title: str, maker: Maker, reads: Names) -> Output:
     return Output(title, "", "", write, reads=reads)
 
 
+P = RUN.products
 OF_MAP = (
-    *(RUN.products.world_tiles, RUN.products.world_risk, RUN.products.world_path, RUN.products.drive),
-    *(RUN.products.disparity, RUN.products.accuracy, RUN.config.vehicle, *colour.READS),
+    *(P.world_tiles, P.world_risk, P.world_path, P.drive, P.disparity, P.accuracy, RUN.config.vehicle),
+    *colour.READS,
 )
-OF_STOPS = (
-    *(RUN.products.disparity, RUN.products.images, RUN.products.local_dem, RUN.products.local_risk),
-    *(RUN.products.local_path, RUN.sequence.rig),
-)
-OF_TRAJECTORY = (
-    *(RUN.products.trajectory, RUN.products.agreement),
-    *(RUN.products.accuracy, RUN.products.crosscheck_accuracy),
-)
-OF_DRIVE = (RUN.products.drive, RUN.products.images, RUN.products.trajectory, RUN.products.accuracy)
+OF_STOPS = (P.disparity, P.images, P.local_dem, P.local_risk, P.local_path, RUN.sequence.rig)
 
 OUTPUTS = (
     _drawing("Map", terrain_map.block, OF_MAP),
-    _drawing("Drive", strips.drive, OF_DRIVE),
+    _drawing("Drive", strips.drive, (P.drive, P.images, P.trajectory, P.accuracy)),
     _drawing("Stops", strips.pairs, OF_STOPS),
-    _drawing("Rig", _rig, (RUN.products.rigs, RUN.products.orientations, RUN.sequence.rig)),
-    _drawing("Trajectory", _trajectory, OF_TRAJECTORY),
+    _drawing("Rig", _rig, (P.rigs, P.orientations, RUN.sequence.rig)),
+    _drawing("Trajectory", _trajectory, (P.trajectory, P.agreement, P.accuracy, P.crosscheck_accuracy)),
     _drawing("Pairs", _pairs, tables.OF_PAIRS),
-    _drawing("Elevation error", _elevation_error, (RUN.products.dem_accuracy,)),
+    _drawing("Elevation error", _elevation_error, (P.dem_accuracy,)),
 )
 """All figures of the page, each with what it reads of a run; the template places them."""
 STAGE = stage("output.figures", "Figures of the report", OUTPUTS)
