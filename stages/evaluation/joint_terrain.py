@@ -115,14 +115,13 @@ def numbers(placed: Placement) -> dict[str, tuple[float, float]]:
 @dataclass(frozen=True)
 class Session:
     """Terrain of a run and its registration: ``pose`` T_first_world, standard deviations ``sigma`` (6,) of x, y, z, m,
-    and of turns about them, rad, at ``centre`` (3,), m, its facts for the JSON file, and a ``doubt``, empty if none."""
+    and of turns about them, rad, at ``centre`` (3,), m, and its facts for the JSON file."""
 
     terrain: Terrain
     pose: RigidTransform
     sigma: Floats
     centre: Floats
     facts: Mapping[str, Any]
-    doubt: str = ""
 
     def covered(self, cell: float) -> Lattice:
         """Part of the first run's lattice that it may cover."""
@@ -144,8 +143,13 @@ def joined(first: Terrain, sessions: Sequence[Session]) -> tuple[Lattice, Merged
     return lattice, merge(layers, lattice, MergeParams.model_validate({}))
 
 
-def registered(first: Terrain, other: Terrain, stated: RigidTransform | None) -> Session:
-    """Register a run to the first one; ``stated``: T_first_world by the georeferences of both.
+def registered(first: Terrain, other: Terrain, stated: RigidTransform | None, tell: Callable[[str], None]) -> Session:
+    """Register a run to the first one.
+
+    Parameters
+    ----------
+    stated : T_first_world by the georeferences of both.
+    tell : takes a line on elevations that do not determine it.
 
     Raises
     ------
@@ -162,7 +166,7 @@ def registered(first: Terrain, other: Terrain, stated: RigidTransform | None) ->
     placed = Placement(stated or RigidTransform.identity(), np.zeros((6, 6)), "georeferences")
     if stated is None:
         placed = register((other.image, first.image), (other.grid, first.grid))
-    start, doubt = placed.pose, ""
+    start = placed.pose
     alignment = _aligned(other.grid, first.grid, start)
     error = dem_comparison.errors(other.grid, first.grid, start if alignment is None else alignment.pose)
     shared = np.isfinite(error)
@@ -171,7 +175,7 @@ def registered(first: Terrain, other: Terrain, stated: RigidTransform | None) ->
         raise DegenerateError("RIL-853", text, remedy="choose runs that share more ground")
     if alignment is None:
         text = f"elevations do not tell how {other.name} lies: it is as the georeferences state, without a sigma"
-        doubt = warning("RIL-855", text)
+        tell(warning("RIL-855", text))
         alignment = Alignment(start, start.apply(other.grid.points()[shared]).mean(axis=0), np.zeros(6))
     # Errors of neighbours correlate: there are fewer independent ones than cells.
     sigma = alignment.sigma * math.sqrt(shared.sum() / max(independent_cells(error), 1.0))
@@ -192,7 +196,7 @@ def registered(first: Terrain, other: Terrain, stated: RigidTransform | None) ->
         "sigma_m_rad": sigma.tolist(),
         "overlap": dem_comparison.figures(error),
     }
-    return Session(other, pose, sigma, alignment.centre, facts, doubt)
+    return Session(other, pose, sigma, alignment.centre, facts)
 
 
 def _aligned(one: Grid, two: Grid, start: RigidTransform) -> Alignment | None:

@@ -46,10 +46,7 @@ def merge(run: Run, *more: Run, output: Annotated[Path, Output], runs: Runs = RU
             raise InputError("RIL-968", text, remedy="name one of them")
     for line in lookup.shared_images(dict.fromkeys(folders)):
         warn(line)
-    sessions = [registered(first, other, _stated(first, other)) for other in others]
-    for one in sessions:
-        if one.doubt:
-            warn(one.doubt)
+    sessions = [registered(first, other, _stated(first, other), warn) for other in others]
     lattice, merged = joined(first, sessions)
     height = merged.elevation if first.place is None else merged.elevation + first.place.origin[2]
     # First, since it marks the folder as ours, so that the same command can continue after a kill.
