@@ -53,7 +53,7 @@ def _versions() -> str:
     """Version of the program, of what its results depend on, and the machine's kind; one a line."""
     import platform
 
-    from rille.pipeline.engine.packages import installed
+    from rille.pipeline.engine.keys import installed
 
     versions = installed() | {"system": f"{platform.system()} {platform.machine()}"}
     return "\n".join(f"{name:24s} {version}" for name, version in versions.items())
@@ -102,12 +102,11 @@ def main(argv: list[str] | None = None) -> None:
 
 def prepare() -> None:
     """One thread a library, safe kernels, and nothing of the current folder, before NumPy and numba are imported."""
-    from rille.pipeline.engine.runtime import apart
-    from rille.pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime import environment
 
-    prepare_environment()
-    apart.leave_out()
-    apart.ignore_settings()
+    environment.prepare_environment()
+    environment.leave_out()
+    environment.ignore_settings()
 
 
 def _run(argv: list[str] | None) -> int:

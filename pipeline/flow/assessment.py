@@ -15,7 +15,7 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 from rille.pipeline.engine.graph import Wait, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow.builders import Builder, Pair
 from rille.stages.evaluation.accuracy import accuracy_stage
 from rille.stages.evaluation.agreement import agreement_stage

@@ -86,9 +86,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     """
     prepare_environment()
     from rille.pipeline.flow import tiles
-    from rille.pipeline.runs.doubts import doubts, levelled
+    from rille.stages.calibration.doubt import doubts
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
+    from rille.stages.imaging.levels import levelled
 
     carried, marks = settings_of(left), [mark for image in (left, right) for mark in noted(image).get("images", [None])]
     built: Any = config.build(carried, {"hfvm": hfvm})

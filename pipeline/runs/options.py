@@ -154,7 +154,7 @@ class WatchOptions(Options):
 
 def cache_folder(given: str | Path | None) -> Path:
     """Return the folder of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
-    from rille.pipeline.engine.store.folder import locate
+    from rille.pipeline.engine.store.base import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 
