@@ -12,8 +12,8 @@ across a depth jump between two pixels nothing was seen: the cell is occluded th
 
 **Which change, where there are several.** The search begins at the top of the cell's interval. If the point there is
 free, it goes down to the first change; if it is behind the surface, it first goes up to the nearest change above the
-start. A change *stands* if its residual, its slope and the jump of the disparities around it are within the limits;
-after one that does not, the search goes on, downwards from the start in the end. So the result is the highest change
+start. A change *stands* if its slope and the jump of the disparities around it are within the limits; after one that
+does not, the search goes on, downwards from the start in the end. So the result is the highest change
 that stands at or below the start, or the nearest one above it. A cell whose interval, handed down from its coarse
 neighbours, lies wholly on another surface may so miss one that a search of the whole range would find.
 """
@@ -48,15 +48,14 @@ class Observed(NamedTuple):
     """What is read at a pixel of the left image (rows, cols).
 
     ``disparity`` (rows, cols, 2) right minus left, column and row, pixels, NaN where it must not be used; ``std``
-    (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_residual`` and ``max_jump``
-    (in the bilinear cell) of a solution, pixels; ``axes`` (2, 2) where a column and a row of the left image lead in the
+    (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_jump`` of the disparities in
+    the bilinear cell of a solution, pixels; ``axes`` (2, 2) where a column and a row of the left image lead in the
     right one, see :func:`rille.stages.geometry.scale.axes`.
     """
 
     disparity: Floats32
     std: Floats32
     image: Floats32
-    max_residual: float
     max_jump: float
     axes: Floats
 
@@ -324,7 +323,7 @@ def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     z, at = root(lines, bracket, epipole, disparity)
     residual = math.sqrt((at.s * at.s + at.across * at.across) / at.power)
     c, r = np.uint32(at.x), np.uint32(at.y)
-    if not residual <= seen.max_residual or is_jump(disparity, seen, r, c):
+    if math.isnan(residual) or is_jump(disparity, seen, r, c):
         return nothing
     # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
     above, below = mismatch(lines, z + dz, epipole, disparity), mismatch(lines, z - dz, epipole, disparity)
