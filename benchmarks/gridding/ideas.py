@@ -43,7 +43,10 @@ TWO_WAYS: tuple[tuple[str, dict[str, Any], Changes], ...] = (("both directions",
 def table(half: str) -> None:
     """Print the table of one half of the seeds."""
     scenes = list(_scenes(SEEDS[half]))
-    print("| left out | RMS error | of the surest 70 % | completeness | within 1 std | 2 std | beyond 4 std, % |\n|---|---|---|---|---|---|---|")
+    print(
+        "| left out | RMS error | of the surest 70 % | completeness | within 1 std | 2 std | beyond 4 std, % |\n"
+        "|---|---|---|---|---|---|---|"
+    )
     for ideas, given in ((IDEAS, {}), (TWO_WAYS, {"both": True})):
         whole = [_figures(scene, given, {}) for scene in scenes]
         _row("nothing" + (", both directions" if given else ""), whole, whole)
@@ -68,7 +71,7 @@ def _scenes(seeds: tuple[int, ...]) -> Iterator[tuple[Any, dict[str, Any]]]:
 
 
 def _figures(given: tuple[Any, dict[str, Any]], params: dict[str, Any], changes: Changes) -> list[float]:
-    """RMS error of all and of the surest cells, completeness, shares within one and two standard deviations, beyond four."""
+    """RMS error of all and of the surest cells, completeness, shares within one and two and beyond four deviations."""
     (scene, found), before = given, {place: getattr(*place) for place in changes}
     chosen = LocusParams(**{"max_sigma": scene.max_sigma, **params})
     forth, back = (Matches(d.column, d.row, d.usable(np.inf), d.std) for d in (found["forth"], found["back"]))

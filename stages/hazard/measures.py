@@ -191,7 +191,8 @@ MEASURES = (
         "least height left under the belly, over headings", on_blocks=True, below=True, left=True,
     ),
 )  # fmt: skip
-"""All measures. Bits 1 << 1 (the height range of former versions) and 1 << 7 to 1 << 10 of ``reason`` are taken (:mod:`rille.stages.hazard.classification`)."""
+"""All measures. Of the bits of ``reason``, 1 << 1 (the height range of former versions) and 1 << 7 to 1 << 10
+(:mod:`rille.stages.hazard.classification`) are taken."""
 
 BITS = {m.name: m.bit for m in MEASURES}
 WHEEL_BITS = np.uint16(sum(m.bit for m in MEASURES if not m.below))

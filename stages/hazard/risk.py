@@ -80,7 +80,8 @@ def risk_map(
     Returns
     -------
     ``risk`` uint8 (0 safe, 1 caution, 2 hazard, 3 unknown), ``reason`` uint16 bits; float32, NaN where unknown:
-    ``inclination``, ``slope``, ``tilt`` rad, ``step``, ``roughness``, ``clearance`` (left under the belly) m, ``p_hazard``, ``p_wheel``; ``filled`` uint8, ``elevation`` float32 m (closed).
+    ``inclination``, ``slope``, ``tilt`` rad, ``step``, ``roughness``, ``clearance`` (left under the belly) m,
+    ``p_hazard``, ``p_wheel``; ``filled`` uint8, ``elevation`` float32 m (closed).
 
     Raises
     ------

@@ -72,7 +72,7 @@ def solve(seen: Observed, cameras: PairCameras, lattice: Lattice, z_range: tuple
     """Every cell of a lattice, coarse to fine: a few coarse cells search the whole ``z_range``, m."""
 
     def searched(cells: Cells) -> Dem:
-        out = Dem(*np.full((4, *cells.low.shape), np.nan, np.float32))
+        out = Dem(*np.full((3, *cells.low.shape), np.nan, np.float32))
         search(cells, z_range, cameras, seen, out)
         return out
 
@@ -102,5 +102,4 @@ def join(a: Dem, b: Dem) -> Dem:
     z = np.where(both, zb + share * (za - zb), np.where(only_a, za, zb))
     # Errors of cells matched one way alone are two to three times as large.
     std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), 2.0 * np.where(only_a, sa, sb))
-    residual = np.where(only_a, a.residual, b.residual)
-    return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)
+    return Dem(z.astype(np.float32), std.astype(np.float32), a.ortho)

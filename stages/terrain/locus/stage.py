@@ -205,7 +205,7 @@ def _lead_to(back: Matches, marked: Bools) -> Bools:
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
-    """Bytes of the model's arrays, four of float32, and a half more for refining them."""
+    """Bytes of the model's arrays, three of float32, and as many for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
     elif "no_ground" in metas["level"]:
@@ -247,7 +247,6 @@ class LocusInputs(NamedTuple):
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),
-        raster("residual", "px", "mismatch of disparity and calibration at the elevation", frame=_FRAME),
         raster("ortho", "grey", "grey value of the left image, 0..255", frame=_FRAME),
     ],
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),

@@ -241,9 +241,7 @@ def test_without_steps_or_a_right_image_the_disparity_decides() -> None:
 
 
 def flat(elevation: list[float], std: list[float]) -> Dem:
-    arrays = [np.array([values], np.float32) for values in (elevation, std, [0.1] * len(std), [9.0] * len(std))]
-    arrays[2][~np.isfinite(arrays[0])] = np.nan
-    return Dem(*arrays)
+    return Dem(*(np.array([values], np.float32) for values in (elevation, std, [9.0] * len(std))))
 
 
 def test_both_directions_are_joined_by_hand() -> None:
@@ -257,7 +255,6 @@ def test_both_directions_are_joined_by_hand() -> None:
         [[np.sqrt(0.02 + 0.09), 0.2, 0.6, nan]],
         rtol=1e-6,
     )
-    np.testing.assert_allclose(found.residual, [[0.1, 0.1, 0.1, nan]], rtol=1e-6)
 
 
 def test_cells_that_one_direction_lost_come_from_the_other() -> None:
