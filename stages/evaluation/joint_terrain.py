@@ -210,9 +210,8 @@ def _aligned(one: Grid, two: Grid, start: RigidTransform) -> Alignment | None:
 def _layer(
     number: int, lattice: Lattice, arrays: Mapping[str, Floats], gain: float = 1.0, pose: Placed = EXACT
 ) -> ModelLayer:
-    """A layer of the merge, whose standard deviations include its residuals."""
+    """A layer of the merge."""
     parts = {name: values.astype(np.float32) for name, values in arrays.items()}
-    parts["residual"] = np.zeros(lattice.shape, np.float32)
     return ModelLayer(number, lattice, lambda name, window: parts[name][window], gain, pose)
 
 
