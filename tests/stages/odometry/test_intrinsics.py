@@ -389,7 +389,7 @@ def test_a_camera_at_rest_tells_no_time_between_its_rows():
 def test_the_time_between_the_rows_is_found_beside_poses_bias_and_errors_of_a_usual_calibration():
     rng, bias, prior = np.random.default_rng(5), 0.3, 1e11
     at = 6  # the bias, behind the poses; then the errors, and the time
-    truth = np.concatenate([rng.normal(size=at + 1), np.zeros(len(calibration_errors.PRIORS)), [0.7]])
+    truth = np.concatenate([rng.normal(size=at + 1), np.zeros(len(calibration_errors.NUMBERS)), [0.7]])
     design = 1e4 * rng.normal(size=(80, len(truth)))
 
     def found(design):
