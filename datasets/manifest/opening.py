@@ -45,6 +45,18 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     return open_described(named, root_folder(manifest.root, path), str(path), digests)
 
 
+def open_folder(manifest: Manifest, folder: Path, digests: files.Digests, spare: Iterable[Path]) -> Sequence:
+    """The sequence of a folder by the manifest of its layout, whose reader finds the files of ``spare`` by itself."""
+    try:
+        return open_described(manifest, folder, str(folder), digests)
+    except InputError as error:
+        wrong = next((path for path in spare if str(path) in error.message), None)
+        if wrong is None:
+            raise
+        remedy = f"{error.remedy}; or rename {wrong}: the folder opens without it"
+        raise type(error)(error.code, error.message, remedy=remedy) from error
+
+
 def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
     """The sequence of a manifest, which comes from a file or from the reader of a folder layout.
 
@@ -164,7 +176,7 @@ def _disparity(
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
     lacking = (k for k, pair in enumerate(pairs) if any(pair.left not in of for of in maps.values()))
-    return source, {k: f"[{key}] has no map of {pairs[k].left.name}" for k in lacking}
+    return source, {k: f"the map of {pairs[k].left.name} ({key}) is missing" for k in lacking}
 
 
 def default_name(path: Path) -> str:
