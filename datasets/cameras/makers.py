@@ -81,8 +81,11 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
 
 
 def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
-    """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set: ``NAME_LEFT``, ``NAME_RIGHT``, and the pose of
-    the right one in the left one's frame as ``pose_quaternion``, x y z w x y z, metres."""
+    """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set.
+
+    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose of
+    the right camera in the left one's frame, metres.
+    """
     parts = {}
     for name, body in SECTION.findall(text):
         rows = {key: value.partition("//")[0].strip(" []").split() for key, value in assignments(body)}

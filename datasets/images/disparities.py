@@ -88,8 +88,9 @@ def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
 
 
 def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:
-    """The map of each left image that has one, by name (without sides' tokens) or number, whichever finds more; by order
-    if names have nothing in common.
+    """The map of each left image that has one, by name (without sides' tokens) or number, whichever finds more.
+
+    By order, if names have nothing in common.
 
     Parameters
     ----------

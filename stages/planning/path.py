@@ -67,7 +67,8 @@ class Route:
     ``cells`` (vertex, 2) of the lattice and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty
     where there is none; ``planner`` that gave it, ``ground`` one of :data:`GROUNDS`. ``span``: farthest and nearest row
     that are free somewhere. ``reason`` why there is no path, and ``blocking_row``, the first one that cannot be entered
-    by rows, None where there is a path, or none was sought by rows; ``ended_by``: why a path goes no farther, None where there is none.
+    by rows, None where there is a path, or none was sought by rows; ``ended_by``: why a path goes no farther, None
+    where there is none.
     """
 
     cells: Ints
