@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
-from rille.datasets.cameras.text import parse_nested
+from rille.datasets.cameras.text import entries, parse_nested
 from rille.datasets.text.reading import GREATEST, read_text
 from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.core.arrays import Floats
@@ -83,6 +83,12 @@ class Fields:
     def read(path: Path) -> Fields:
         """Entries of a file of its own beside a calibration."""
         return Fields(parse_nested(read_text(path, "calibration"), str(path)), str(path))
+
+    @staticmethod
+    def of_lines(lines: Iterable[tuple[str, str]], file: str, at: str = "") -> Fields:
+        """Entries of lines of key and value, which is a list if it has several words, perhaps in brackets."""
+        rows = ((key, value.partition("//")[0].strip(" []").replace(";", " ").split()) for key, value in lines if key)
+        return Fields(entries(((key, row if row[1:] else "".join(row)) for key, row in rows), file), file, at)
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None

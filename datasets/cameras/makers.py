@@ -83,17 +83,13 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
 def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set.
 
-    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose of
-    the right camera in the left one's frame, metres.
+    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose
+    of the right camera in the left one's frame, metres.
     """
-    parts = {}
-    for name, body in SECTION.findall(text):
-        rows = {key: value.partition("//")[0].strip(" []").split() for key, value in assignments(body)}
-        parts[name] = Fields({k: v if v[1:] else "".join(v) for k, v in rows.items()}, str(path), f"{name} ")
+    parts = {name: Fields.of_lines(assignments(body), str(path), f"{name} ") for name, body in SECTION.findall(text)}
     whole = next(name for name in parts if name.endswith(MRPT)).removesuffix(MRPT)
-    pose, *sides = (
-        parts.get(at, Fields({}, str(path), f"{at} ")) for at in (f"{whole}{end}" for end in (MRPT, "_LEFT", "_RIGHT"))
-    )
+    names = (whole + end for end in (MRPT, "_LEFT", "_RIGHT"))
+    pose, *sides = (parts.get(name) or Fields({}, str(path), f"{name} ") for name in names)
     left, right = (f.distorted("dist", f.optics("fx fy cx cy", f.size("resolution"), "none").camera) for f in sides)
     numbers = pose.numbers("pose_quaternion", 7)
     T_left_right = pose.by_quaternion("pose_quaternion", numbers[3:], numbers[:3])
@@ -242,9 +238,7 @@ def beside(f: Fields) -> RigidTransform | None:
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here in metres."""
-    values = entries((line for line in assignments(text) if line[0]), str(path))
-    rows = {key: value.strip("[]").replace(";", " ").split() for key, value in values.items() if value.startswith("[")}
-    f = Fields(values | rows, str(path))
+    f = Fields.of_lines(assignments(text), str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

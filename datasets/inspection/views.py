@@ -206,7 +206,11 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
         alternate = 'images.left = "*[02468].png", images.right = "*[13579].png", images.pair = "order"'
-        remedy += f" (of images that show left and right in turn by {alternate})" if not sum(counts) else ""
+        remedy += (
+            f" (of images that show left and right in turn by {alternate})"
+            if not (sum(counts) or of_one_camera(folder))
+            else ""
+        )
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 
