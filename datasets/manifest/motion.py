@@ -325,7 +325,7 @@ class MotionReader:
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"
-            remedy = f"raise {table}.max_gap, if straight lines between them are exact enough"
+            remedy = f"raise {table}.max_gap, if straight lines between them are exact enough; name a unit: time_ms"
             raise InputError("RIL-804", text, remedy=remedy)
 
     def positions(
