@@ -60,8 +60,8 @@ def export(sequence: Sequence, folder: Path, materialise: Materialise) -> None:
         (folder / VEHICLE_FILE).write_text(tomli_w.dumps({"vehicle": sequence.vehicle.model_dump()}), "utf-8")
     basic = range(0, sequence.frames, int(sequence.defaults.get("keyframes.stride", 1)))
     for frame in sorted({*basic} - {*sequence.lost}):
-        if sequence.truth_disparity is not None:
-            _write_disparity(folder, sequence.frame_names[frame], materialise(sequence.truth_disparity(frame)))
+        if sequence.truth_disparity is not None and (exact := sequence.truth_disparity(frame)) is not None:
+            _write_disparity(folder, sequence.frame_names[frame], materialise(exact))
         _write_dem(sequence, folder, frame, materialise)
     sizes = [f"{camera.width} x {camera.height}" for camera in (sequence.rig.left, sequence.rig.right)]
     text = Path(__file__).with_name(README).read_text(encoding="utf-8")

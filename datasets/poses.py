@@ -237,7 +237,10 @@ def positions_of(
         text = f"{table.name}: its columns ({names}) do not say which are x and y in metres"
         remedy = 'name them in the manifest: columns = { time = "NAME", x = "NAME", y = "NAME" }, or numbers'
         if any(map(NOT_IN_PLANE.search, table.header)):
-            remedy = "give decimal degrees (neither minutes nor degrees times 10^7) in columns latitude and longitude"
+            remedy = (
+                "give decimal degrees, negative in the south and west (neither minutes nor degrees times 10^7), in "
+            )
+            remedy += "columns latitude and longitude"
             remedy += ", or metres in a plane, as UTM has them (easting, northing), in columns x and y"
         raise InputError("RIL-805", text, remedy=remedy)
     placed = [meant["x"], meant["y"]]

@@ -158,7 +158,7 @@ class Sequence:
     georeference : where the world frame lies, where that is known.
     vehicle : the vehicle whose limits suit the scale of the sequence.
     truth_dem : exact elevations on any lattice of any frame whose pose in the truth frame is given.
-    truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair.
+    truth_disparity : ``truth_disparity(frame)``: source of the exact disparity of a pair; None where it is not known.
     disparity : ``disparity(frame)``: source of the ``column_disparity`` of a pair (right minus left, pixels) that
         another program made, and maybe its ``disparity_std``; it is checked, and takes the matcher's place.
     masks : of cameras, files that say which pixels never show the scene (see :mod:`rille.datasets.images.masks`).
@@ -195,7 +195,7 @@ class Sequence:
     georeference: Georeference | None = None
     vehicle: Vehicle | None = None
     truth_dem: TruthDem | None = None
-    truth_disparity: Callable[[int], Source] | None = None
+    truth_disparity: Callable[[int], Source | None] | None = None
     disparity: Callable[[int], Source] | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
     evaluation_window: tuple[float, float, float, float] | None = None

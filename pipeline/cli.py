@@ -89,6 +89,9 @@ app = program()
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``rille``."""
+    if argv is None and sys.getfilesystemencoding() != "utf-8":
+        # Names of files are in UTF-8 in any locale; in that of ASCII they could be neither printed nor written.
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
     with plain_output():
         try:
             code = _run(argv)

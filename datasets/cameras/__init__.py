@@ -25,10 +25,10 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
-    "camodocal, VINS, Basalt, mrcal, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), COLMAP, "
-    "Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) are read; "
-    "of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's K and R "
-    "transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
+    "camodocal, VINS, Basalt, mrcal, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
+    "COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) "
+    "are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's "
+    "K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -46,6 +46,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
+    (lambda text: f"{makers.MRPT}]" in text, makers.mrpt),
     (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
@@ -68,6 +69,7 @@ NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[Cali
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
     (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
     (lambda f: "value0" in f, slam.basalt),
+    (lambda f: "camRect0" in f.sub("intrinsics") if "intrinsics" in f else False, slam.dsec),
     (makers.has_figures, makers.figures),
 )
 """Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are

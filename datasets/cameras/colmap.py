@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import read_text
@@ -60,8 +58,6 @@ def colmap(text: str, path: Path) -> list[CalibratedCamera]:
 
 def _rig(path: Path) -> dict[str, RigidTransform]:
     """T_camera_rig by camera number; empty if there is no rig, or more than one."""
-    from scipy.spatial.transform import Rotation
-
     lines = _lines(read_text(path, "rigs")) if path.is_file() else []
     if len(lines) != 1 or len(lines[0]) < 4 or lines[0][2] != "CAMERA":
         return {}
@@ -74,13 +70,10 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
         if known == "0":
             continue
         f = Fields({"pose": rest[:7]}, str(path), f"sensor {number} ")
-        w, x, y, z, *t = f.numbers("pose", 7)
-        if not any((w, x, y, z)):
-            raise f.error("RIL-110", "pose", "has a quaternion of length 0")
+        wxyz = f.numbers("pose", 7)
         rest = rest[7:]
         if kind == "CAMERA":
-            # SciPy has the scalar last, COLMAP first.
-            poses[number] = RigidTransform(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(t))
+            poses[number] = f.by_quaternion("pose", wxyz[:4], wxyz[4:])
     return poses
 
 

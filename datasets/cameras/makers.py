@@ -20,13 +20,16 @@ from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
 from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.units import METRIC, unit_of, unitless
+from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]([^\[]*)", re.MULTILINE)
+SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]((?:.*\n(?![ \t]*\[))*.*)", re.MULTILINE)
 ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
 """Of a ``.conf``: a section with its text, and one of its entries."""
+
+MRPT = "_LEFT2RIGHT_POSE"
+"""End of the name of a section of MRPT's."""
 
 ZED_SIZES = {
     "VGA": (672, 376),
@@ -75,6 +78,22 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
     lens = f.optics("fx fy cx cy", size, "fisheye" if "k4" in f and "p1" not in f else "rational")
     f.check_lens()
     return lens
+
+
+def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
+    """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set.
+
+    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose
+    of the right camera in the left one's frame, metres.
+    """
+    parts = {name: Fields.of_lines(assignments(body), str(path), f"{name} ") for name, body in SECTION.findall(text)}
+    whole = next(name for name in parts if name.endswith(MRPT)).removesuffix(MRPT)
+    names = (whole + end for end in (MRPT, "_LEFT", "_RIGHT"))
+    pose, *sides = (parts.get(name) or Fields({}, str(path), f"{name} ") for name in names)
+    left, right = (f.distorted("dist", f.optics("fx fy cx cy", f.size("resolution"), "none").camera) for f in sides)
+    numbers = pose.numbers("pose_quaternion", 7)
+    T_left_right = pose.by_quaternion("pose_quaternion", numbers[3:], numbers[:3])
+    return stereo_cameras(left, right, T_left_right.inverse())
 
 
 def depthai(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -214,14 +233,12 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
 def beside(f: Fields) -> RigidTransform | None:
     """T_right_left of parallel cameras by a ``baseline``, metres or the unit in its key; None if there is none."""
     keys = [key for key in f.values if unitless(key).lower() == "baseline" and key in f]
-    return parallel(f.number(keys[0]) * METRIC.get(unit_of(keys[0]), 1.0)) if len(keys) == 1 else None
+    return parallel(f.number(keys[0]) * LENGTHS.get(unit_of(keys[0]), f.unit)) if len(keys) == 1 else None
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here in metres."""
-    values = entries((line for line in assignments(text) if line[0]), str(path))
-    rows = {key: value.strip("[]").replace(";", " ").split() for key, value in values.items() if value.startswith("[")}
-    f = Fields(values | rows, str(path))
+    f = Fields.of_lines(assignments(text), str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

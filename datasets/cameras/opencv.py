@@ -181,10 +181,11 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
 
 
 def relative(f: Fields) -> RigidTransform | None:
-    """T_right_left, stated as such or by R and T; None if there is none."""
-    if WHOLE in f:
-        return f.pose(WHOLE)
-    return f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS)) if f.has(*POSE) else None
+    """T_right_left, metres, stated as such or by R and T; None if there is none."""
+    if not f.has(*POSE):
+        return None
+    T = f.pose(WHOLE) if WHOLE in f else f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS))
+    return RigidTransform(T.rotation, T.translation * f.unit)
 
 
 def _beside(path: Path) -> Fields | None:

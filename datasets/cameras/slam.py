@@ -15,8 +15,8 @@ from rille.datasets.images.pairing import natural
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C")
-"""Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS."""
+BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C", "T_b")
+"""Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS, VBR."""
 
 BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
 """Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
@@ -100,8 +100,6 @@ def vins(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of Basalt's JSON: ``T_imu_cam`` maps each camera to the IMU by a quaternion, metres."""
-    from scipy.spatial.transform import Rotation
-
     f = f.sub("value0")
     cameras, poses, sizes = (
         Fields(dict(enumerate(f.get(key))), f.file, f"{f.at}{key}.", f.used)
@@ -110,14 +108,26 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
     found = []
     for k in cameras.values:
         camera, pose = cameras.sub(k), poses.sub(k)
-        kind, q = camera.text("camera_type"), np.array([pose.number(f"q{axis}") for axis in "xyzw"])
+        kind, q = camera.text("camera_type"), [pose.number(f"q{axis}") for axis in "wxyz"]
         if kind not in BASALT:
             raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
-        if abs(np.linalg.norm(q) - 1) > 0.01:
-            raise pose.error("RIL-767", "qx, qy, qz, qw", f"have length {np.linalg.norm(q):.4g}, it should be 1")
         lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.size(k), BASALT[kind])
-        T = RigidTransform(Rotation.from_quat(q).as_matrix(), np.array([pose.number(f"p{axis}") for axis in "xyz"]))
+        T = pose.by_quaternion("qx, qy, qz, qw", q, [pose.number(f"p{axis}") for axis in "xyz"])
         found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
+    return found
+
+
+def dsec(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of DSEC's ``cam_to_cam.yaml``: ``T_10`` maps camera 0 to camera 1, metres, and so on, and ``R_rect1``
+    camera 1 to that of its rectified images, ``camRect1``."""
+    stated, placed, found = f.sub("intrinsics"), f.sub("extrinsics"), list[CalibratedCamera]()
+    T = RigidTransform.identity()
+    for k in range(len([key for key in stated.values if re.fullmatch(r"cam\d", key)])):
+        T = placed.pose(f"T_{k}{k - 1}") @ T if k else T
+        turn = placed.rigid(f"R_rect{k}", placed.matrix(f"R_rect{k}", 3, 3), np.zeros(3))
+        raw, ideal = (_pinhole_lens(stated.sub(f"{name}{k}"), "distortion_coeffs") for name in ("cam", "camRect"))
+        rectified = CalibratedCamera(f"cam{k}", ideal, turn @ T)
+        found.append(CalibratedCamera(f"cam{k}", raw, T, rectified))
     return found
 
 
@@ -146,8 +156,9 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     if kind.lower() != "pinhole":
         remedy = "calibrate as pinhole with radtan or equidistant"
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
-    fx, fy, cx, cy = f.numbers("intrinsics", 4)
-    return f.distorted(distortion, f.camera("intrinsics", (fx, fy, cx, cy), f.size("resolution")))
+    key = f.spelt(("intrinsics", "camera_matrix"))  # the latter of DSEC
+    fx, fy, cx, cy = f.numbers(key, 4)
+    return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), f.size("resolution")))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -87,8 +87,10 @@ def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
     return values
 
 
-def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path]:
-    """The map of each left image, by name (without sides' tokens) or number; by order if names have nothing in common.
+def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:
+    """The map of each left image that has one, by name (without sides' tokens) or number, whichever finds more.
+
+    By order, if names have nothing in common.
 
     Parameters
     ----------
@@ -98,24 +100,21 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> list[Path
     Raises
     ------
     InputError
-        Maps and images do not fit, or the pattern is none.
+        No image has a map, or the pattern is none.
     """
     with within(key):
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
-    lacking = list[str]()
+    found: dict[Path, Path] = {}
     for name in (lambda path: without_side(path.stem, 0), last_number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
-        if len(ours) < len(maps) or len(theirs) < len(lefts):
-            continue  # keys are not unique
-        if ours.keys() >= theirs.keys():
-            return [ours[one] for one in theirs]
-        if not (lacking or ours.keys().isdisjoint(theirs)):
-            lacking = [path.name for one, path in theirs.items() if one not in ours]
-    if len(maps) == len(lefts) and (len(maps) == 1 or not lacking):
-        return maps
+        if len(ours) == len(maps) and len(theirs) == len(lefts):  # else keys are not unique
+            found = max(found, {path: ours[one] for one, path in theirs.items() if one in ours}, key=len)
+    if len(maps) == len(lefts) and (len(maps) == 1 or not found):
+        found = dict(zip(lefts, maps, strict=True))
+    if found:
+        return found
     those = ends(maps) if maps else f"none in {root}"
     text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({those}) for {count(len(lefts), 'left image')}"
-    text += f", none for {lacking[0]}" if lacking else ""
     remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
     raise InputError("RIL-901", text, remedy=remedy)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import split
 from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
+from rille.datasets.text.names import shell_word
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import Sizes
@@ -153,7 +155,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    others = [f"{pattern(of[0], folder)} and its right images: of another set" for at, of in both.items() if at != key]
+    others = [_of_another_set(of, left[0], folder) for at, of in both.items() if at != key]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [relative(path, folder) for path in photographs if path not in paired]
     if computed := [relative(path, folder) for path in images if path not in set(photographs)]:
@@ -161,6 +163,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):
         taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
         lines.append(f"{taken}; if they are frames of one, name its folder left or right")
+    places = dict.fromkeys(os.path.commonpath([pair.left.parent, pair.right.parent]) for pair in matched)
+    if len(places) == len(matched) > 1 and not all(re.search(r"\d$", place) for place in places):
+        one = f"`rille init {shell_word(next(iter(places)))}`"
+        lines.append(
+            f"each pair has a folder of its own: if they are scenes, not frames of one camera, {one} takes one"
+        )
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -176,6 +184,15 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     )
 
 
+def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: Path) -> str:
+    """A line on pairs beside those of the left image ``taken``, and how they are opened."""
+    place = Path(os.path.commonpath([path.parent for of in sides for path in of]))
+    # A folder of a camera is none of pairs.
+    own = taken.is_relative_to(place) or not place.is_relative_to(folder)
+    how = "images.left and images.right of a manifest" if own else f"`rille init {shell_word(place)}`"
+    return f"{pattern(sides[0], folder)} and its right images: of another set, which {how} would take"
+
+
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
     text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
@@ -188,6 +205,12 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             header = common_header(images[:1]).header
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
+        alternate = 'images.left = "*[02468].png", images.right = "*[13579].png", images.pair = "order"'
+        remedy += (
+            f" (of images that show left and right in turn by {alternate})"
+            if not (sum(counts) or of_one_camera(folder))
+            else ""
+        )
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
 
 

@@ -45,6 +45,18 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     return open_described(named, root_folder(manifest.root, path), str(path), digests)
 
 
+def open_folder(manifest: Manifest, folder: Path, digests: files.Digests, spare: Iterable[Path]) -> Sequence:
+    """The sequence of a folder by the manifest of its layout, whose reader finds the files of ``spare`` by itself."""
+    try:
+        return open_described(manifest, folder, str(folder), digests)
+    except InputError as error:
+        wrong = next((path for path in spare if str(path) in error.message), None)
+        if wrong is None:
+            raise
+        remedy = f"{error.remedy}; or rename {wrong}: the folder opens without it"
+        raise type(error)(error.code, error.message, remedy=remedy) from error
+
+
 def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
     """The sequence of a manifest, which comes from a file or from the reader of a folder layout.
 
@@ -61,12 +73,17 @@ def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequen
     base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
     if manifest.disparity is not None:
         note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
-        base = replace(base, disparity=disparity, notes=(*base.notes, note))
+        disparity, absent = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
+        base = replace(base, disparity=disparity, lost={**absent, **base.lost}, notes=(*base.notes, note))
     if manifest.truth_disparity is not None:
-        exact = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
+        exact, absent = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
-        base = replace(base, truth_disparity=exact, notes=(*base.notes, note))
+        note += f" {len(pairs) - len(absent)} of {len(pairs)} pairs" if absent else ""
+
+        def judged(frame: int) -> Source | None:
+            return None if frame in absent else exact(frame)
+
+        base = replace(base, truth_disparity=judged, notes=(*base.notes, note))
     sequence = MotionReader(root, pairs, base, digests.growing, manifest.world.crs or "").read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     return replace(
@@ -133,15 +150,14 @@ def _disparity(
     sequence: Sequence,
     pairs: tuple[ImagePair, ...],
     digests: files.Digests,
-) -> Callable[[int], Source]:
-    """Function that returns the source of another program's, or of the true disparity of a frame; ``key``: name of the
-    table."""
+) -> tuple[Callable[[int], Source], dict[int, str]]:
+    """Function that returns the source of another program's, or of the true disparity of a frame; and why frames have
+    none. ``key``: name of the table."""
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
-    frames = [k for k, pair in enumerate(pairs) if not pair.absent]
-    lefts = [pairs[k].left for k in frames]
+    lefts = [pair.left for pair in pairs if not pair.absent]
     maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{key}.left")}
     claimed = stated.sigma if isinstance(stated, Disparity) else None
     sigma = claimed if isinstance(claimed, float) else None
@@ -149,16 +165,18 @@ def _disparity(
         maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
-    for first, *_ in maps.values():
+    for of in maps.values():
+        first = next(iter(of.values()))
         disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # raises errors early
 
     def source(frame: int) -> Source:
-        paths = {array: of[frames.index(frame)] for array, of in maps.items()}
+        paths = {array: of[pairs[frame].left] for array, of in maps.items()}
         args = {**common, "frame": frame, "digests": {array: digests.sha256(path) for array, path in paths.items()}}
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
-    return source
+    lacking = (k for k, pair in enumerate(pairs) if any(pair.left not in of for of in maps.values()))
+    return source, {k: f"the map of {pairs[k].left.name} ({key}) is missing" for k in lacking}
 
 
 def default_name(path: Path) -> str:

@@ -59,8 +59,8 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
 def of_pair(make: Builder, pair: Pair) -> Flow:
     """Compare the disparity of a pair and its local elevation model with the truth."""
     exact_disparity = make.sequence.truth_disparity
-    if exact_disparity is not None:
-        true = make.source(exact_disparity(pair.frame), f"truth_disparity/{pair.frame}")
+    if exact_disparity is not None and (known := exact_disparity(pair.frame)) is not None:
+        true = make.source(known, f"truth_disparity/{pair.frame}")
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )

@@ -242,7 +242,8 @@ def terrain(
         Of :func:`match`, of this pair; pixels that :meth:`xarray.Dataset.where` masks count as unmatched. Enough are
         ``column_disparity`` and ``row_disparity`` (row, col), right minus left, px, NaN unknown: without ``validity``
         all known pixels count as matched, without ``disparity_std`` their standard deviation is
-        ``locus.sigma_disparity``.
+        ``locus.sigma_disparity``. Without the attributes of :func:`match` parameters are those of the sequence, not
+        those that go with its preset.
     pair
         The pair.
     reference

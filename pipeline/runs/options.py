@@ -61,10 +61,10 @@ class Settings:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Work(Settings):
-    """:class:`Settings`, and options that choose where tasks run; ``executor`` may also be a ``Client`` of dask.
+class Options(Settings):
+    """:class:`Settings`, and options that choose where tasks run, the part that is made, and the messages during a run.
 
-    With ``runs``, so that a plan takes the command line of its run.
+    A plan takes them all, so that it takes the command line of its run. ``executor`` may also be a ``Client`` of dask.
 
     Parameters
     ----------
@@ -76,22 +76,6 @@ class Work(Settings):
         Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port.
     memory_limit
         Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free.
-    """
-
-    jobs: int | None = None
-    force: Annotated[frozenset[str], SEVERAL] = frozenset()
-    executor: Any = "dask"
-    memory_limit: str | None = None
-    runs: Runs = RUNS
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Options(Work):
-    """:class:`Work`, and options of the part that is made and of the messages during a run.
-
-    Parameters
-    ----------
     keep_going
         After a failure, finish all tasks that do not depend on it; the exit status is then 3.
     until
@@ -104,6 +88,11 @@ class Options(Work):
         The same as --progress quiet: warnings and errors only.
     """
 
+    jobs: int | None = None
+    force: Annotated[frozenset[str], SEVERAL] = frozenset()
+    executor: Any = "dask"
+    memory_limit: str | None = None
+    runs: Runs = RUNS
     keep_going: Annotated[bool, FLAG] = False
     until: Annotated[tuple[str, ...], SEVERAL] = ()
     only: Annotated[tuple[str, ...], SEVERAL] = ()

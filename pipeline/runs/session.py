@@ -39,7 +39,7 @@ from rille.pipeline.report.delivery import lacking, left_out
 from rille.pipeline.runs import part_of_run, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
-from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
+from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError, warning, within
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 
@@ -90,7 +90,7 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
     return Settled(sequence=sequence, frames=frames, config=config, vehicle_source=source, given=given)
 
 
-def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
+def settings_of_run(sequence: str | Sequence, options: Options, warn: Callable[[str], None] = warn) -> Settled:
     """As :func:`settings`, for a run: refuse unusable settings; ``warn`` takes warnings about suspicious ones."""
     # Before anything is read or written.
     if options.force:
@@ -113,7 +113,7 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
     return replace(settled, sequence=sequence)
 
 
-def memory_limit(options: Work) -> int | None:
+def memory_limit(options: Options) -> int | None:
     """Bytes that a run may use in total; None: what is free."""
     return None if options.memory_limit is None else memory.parse(options.memory_limit)
 

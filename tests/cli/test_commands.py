@@ -89,6 +89,8 @@ def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(plac
     first, second = place.here(*words), place.here(*words)
     assert (first.status, second.status) == (0, 0), first.err + second.err
     assert re.fullmatch(r"left out, as --only trajectory.tum asks: \d+ known tasks \(.*locus.*\), .*", second.last)
+    planned = place.here("plan", *words[1:])
+    assert (planned.status, " 0 to do" in planned.out) == (0, True), planned.out
     run = tmp_path / "mockup-short" / "latest"
     whole = place.runs("mockup-short")[0]
     assert (run / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()

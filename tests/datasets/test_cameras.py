@@ -413,11 +413,11 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
     np.testing.assert_allclose(rig(*mixed), between.matrix34, atol=1e-12)
     expected = (b @ (b.inverse() @ a).inverse()).matrix34
     np.testing.assert_allclose(rig(*chained), expected, atol=1e-12)
-    for key in ("T_BS", "T_SC"):
+    for key in ("T_BS", "T_SC", "T_b"):
         found = rig((key, a.inverse()), (key, b.inverse()), name="camera_")
         np.testing.assert_allclose(found, between.matrix34, atol=1e-12)
-    with raises("RIL-766", "camera_0.T_b"):
-        rig(("T_b", a.inverse()), ("T_b", b.inverse()), name="camera_")
+    with raises("RIL-766", "camera_0.T_x"):
+        rig(("T_x", a.inverse()), ("T_x", b.inverse()), name="camera_")
 
 
 def test_kalibr_of_one_camera(tmp_path):
@@ -544,6 +544,81 @@ def test_basalt(tmp_path, kind, figures, lens):
     poses[1]["qw"] = half
     with raises("RIL-767", "T_imu_cam.1"):
         read_cameras(written(tmp_path, json.dumps({"value0": values}), "calibration.json"))
+
+
+def test_dsec_has_cameras_before_and_after_rectification(tmp_path):
+    """Four cameras in a row, each turned by one degree against the one before, and back by its rectification."""
+    turns = [rotation_exp([0.0, np.radians(k), 0.0]) for k in range(4)]
+    optics = {"camera_matrix": [560.0, 561.0, 340.0, 220.0], "resolution": [640, 480], "camera_model": "pinhole"}
+    bent = optics | {"distortion_coeffs": [-0.1, 0.05, 0.0, 0.001], "distortion_model": "radtan"}
+    values = {"intrinsics": {}, "extrinsics": {}}
+    for k, R in enumerate(turns):
+        values["intrinsics"] |= {f"cam{k}": bent, f"camRect{k}": optics}
+        values["extrinsics"][f"R_rect{k}"] = R.T.tolist()
+        if k:
+            T = RigidTransform(R, [0, 0, 0]) @ RigidTransform(turns[k - 1].T, [-0.1, 0, 0])
+            values["extrinsics"][f"T_{k}{k - 1}"] = np.vstack([T.matrix34, [0, 0, 0, 1]]).tolist()
+    found = read_cameras(written(tmp_path, json.dumps(values), "cam_to_cam.yaml"))
+    assert [camera.name for camera in found] == ["cam0", "cam1", "cam2", "cam3"]
+    assert found[1].lens.coefficients == (-0.1, 0.05, 0.0, 0.001)
+    np.testing.assert_allclose(rig_of(found[1], found[2])[0].baseline, 0.1)
+    ideal, lenses = rig_of(*(camera.rectified for camera in found[1:3]))
+    assert lenses is None
+    np.testing.assert_allclose(ideal.T_right_left.matrix34[:, :3], np.eye(3), atol=1e-12)
+
+
+MRPT = """# Camera calibration
+[CAMERA_PARAMS_LEFT]
+resolution = [1024 768]
+fx = 600.1
+fy = 600.2
+cx = 518.5
+cy = 383.5
+dist = [-3.4e-01 1.2e-01 0.001 0.002 0.0] // k1 k2 t1 t2 k3
+
+[CAMERA_PARAMS_RIGHT]
+resolution = [1024 768]
+fx = 601
+fy = 602
+cx = 519
+cy = 384
+dist = [0 0 0 0 0]
+
+[CAMERA_PARAMS_LEFT2RIGHT_POSE]
+pose_yaw_pitch_roll = [0.12 0 0 0 -0.5 0] // degrees
+pose_quaternion = [0.12 0.001 0 0.70710678 0.70710678 0 0]
+"""
+
+
+def test_mrpt_states_the_pose_of_the_right_camera_in_the_left_one(tmp_path):
+    left, right = read_cameras(written(tmp_path, MRPT, "camera_params.txt"))
+    assert left.lens == Lens(Camera(600.1, 600.2, 518.5, 383.5, 1024, 768), "radtan", (-0.34, 0.12, 0.001, 0.002, 0.0))
+    T_left_right = right.T_camera_reference.inverse()
+    np.testing.assert_allclose(T_left_right.translation, [0.12, 0.001, 0.0])
+    np.testing.assert_allclose(T_left_right.rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-6)
+    with raises("RIL-113", "CAMERA_PARAMS_RIGHT fx"):
+        read_cameras(written(tmp_path, MRPT.replace("_RIGHT]", "]"), "camera_params.txt"))
+
+
+@pytest.mark.parametrize(
+    ("unit", "length"), [("mm", 120.0), ("millimeters", 120.0), ("CM", 12.0), ("inch", 0.12 / 0.0254), ("m", 0.12)]
+)
+def test_a_stated_unit_of_length(tmp_path, unit, length):
+    K = [500, 0, 320, 0, 500, 240, 0, 0, 1]
+    for stated in ({"T": [-length, 0, 0], "R": np.eye(3).tolist()}, {"baseline": length}):
+        text = json.dumps({"unit": unit, "K1": K, "K2": K, **stated})
+        cameras = read_cameras(written(tmp_path, text, "stereo.json"))
+        np.testing.assert_allclose(cameras[1].T_camera_reference.translation, [-0.12, 0, 0], atol=1e-9)
+    text = f"fx: 500\nfy: 500\ncx: 320\ncy: 240\nunits: {unit}\nbaseline_mm: 120\n"
+    cameras = read_cameras(written(tmp_path, text))
+    np.testing.assert_allclose(cameras[1].T_camera_reference.translation, [-0.12, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", ["rvec_deg: [0.1, 0.5, 0]", "q: [0.9999, 0.01, 0, 0]", "om: [0, 0.01, 0]"])
+def test_a_turn_of_another_form_is_named(tmp_path, turn):
+    text = f"K1: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nK2: [500, 0, 320, 0, 500, 240, 0, 0, 1]\nT: [-1, 0, 0]\n{turn}\n"
+    with raises("RIL-766", turn.split(":")[0]):
+        read_cameras(written(tmp_path, text))
 
 
 def test_matrices_in_a_part_for_each_side(tmp_path):

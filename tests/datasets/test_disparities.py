@@ -159,14 +159,12 @@ def paths(folder, names):
 def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
     paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
     found = find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
-    assert [path.stem for path in found] == wanted.split()
+    assert [path.stem for path in found.values()] == wanted.split()
 
 
 @pytest.mark.parametrize(
     ("lefts", "maps", "lacking"),
     [
-        ("07.png 08.png 09.png", "07.pfm 09.pfm", "none for 08.png"),
-        ("07.png 08.png 09.png", "07.pfm 09.pfm 10.pfm", "none for 08.png"),  # as many, but not of these images
         ("a.png b.png", "1.npy 2.npy 3.npy", ""),
         ("a.png b.png", "map.npy", ""),
         ("a.png", "", "none in /"),
@@ -227,6 +225,18 @@ def test_lost_frames_need_no_map(tmp_path, materialise):
     (tmp_path / "disp" / "01.npy").unlink()
     s = open_manifest(tmp_path / "rover.rille.toml", Digests())
     assert (materialise(s.disparity(2))["column_disparity"] == -30).all()
+
+
+def test_a_frame_without_a_map_is_lost_or_not_judged(tmp_path):
+    sequence(tmp_path, 'left = "disp/*.npy"\nsigma = "sigma/*.npy"')
+    (tmp_path / "disp" / "02.npy").rename(tmp_path / "disp" / "03.npy")  # as many, but not of these images
+    (tmp_path / "sigma" / "00.npy").unlink()
+    s = open_manifest(tmp_path / "rover.rille.toml", Digests())
+    assert s.lost == {k: f"the map of 0{k}.png (disparity) is missing" for k in (0, 2)}
+    s = open_manifest(write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\n'), Digests())
+    assert not s.lost
+    assert [s.truth_disparity(k) is None for k in range(3)] == [False, False, True]
+    assert any("2 of 3 pairs" in note for note in s.notes)
 
 
 def test_a_map_that_changed_since_is_refused(tmp_path, materialise):

@@ -60,6 +60,7 @@ CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
 CAM_3_4 = "A/cam3/rgb/*.png", "A/cam4/rgb/*.png"
 LEFT_RIGHT = "*/left.png", "*/right.png"
 CAMERA_0_2 = "camera_00/im*.png", "camera_02/im*.png"
+CAMERA_0_2_OF_SCENES = "*/camera_00/im0.png", "*/camera_02/im0.png"
 LCAM = "image_lcam/*.png", "image_rcam/*.png"
 
 
@@ -90,6 +91,7 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         ([f"A/cam{c}/{what}/{k}.png" for c in (3, 4) for what in ("rgb", "depth") for k in (1, 2, 3)], *CAM_3_4, 3),
         ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
         ([f"run{k}/cam_{c}.png" for k in (1, 2) for c in (3, 4)], "*/cam_3.png", "*/cam_4.png", 2),
+        ([f"{s}/camera_{c}/im0.png" for s in ("a_b", "c") for c in ("00", "02")], *CAMERA_0_2_OF_SCENES, 2),
         ([f"camera_{c}/im0.png" for c in ("00", "02")], "camera_00/im0.png", "camera_02/im0.png", 1),
         *([[f"camera_{c}/im{k}.png" for c in ("00", "02") for k in range(n)], *CAMERA_0_2, n] for n in (2, 3, 5)),
         ([f"{c}/im{k}.png" for c in ("im0", "im1") for k in range(3)], "im0/im*.png", "im1/im*.png", 3),
@@ -400,6 +402,20 @@ def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     found = inspect(tmp_path)
     assert (found.views.left, found.views.right, found.views.pairs) == ("day1_left_*.png", "day1_right_*.png", 3)
     assert any(line.startswith("day2_left_*.png and its right images") for line in found.unread)
+
+
+def test_scenes_beside_each_other_are_named_with_the_command_that_takes_one(tmp_path):
+    write_images(tmp_path, [f"{s}/im{k}.png" for s in ("aloe", "teddy bear") for k in (0, 1)])
+    assert f"`rille init '{tmp_path}/teddy bear'` would take" in " ".join(inspect(tmp_path).unread)
+    write_images(tmp_path / "two", [f"{s}/camera_0{c}/im0.png" for s in ("art", "dolls") for c in (0, 2)])
+    views = inspect(tmp_path / "two").views
+    assert (views.pairs, f"`rille init {tmp_path}/two/art`" in views.lines[-1]) == (2, True)
+
+
+def test_images_in_turn_are_refused_with_the_patterns_of_a_manifest(tmp_path):
+    write_images(tmp_path, [f"{k:02d}.png" for k in range(6)])
+    with raises("RIL-194", "*[02468].png", "*[13579].png"):
+        inspect(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["my.rille.toml", "my.toml"])

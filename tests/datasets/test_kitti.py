@@ -279,6 +279,16 @@ def test_real_street(data_dir, materialise):
     assert image.dtype == np.uint8
 
 
+@pytest.mark.parametrize(("name", "code"), [("poses.txt", "RIL-230"), ("times.txt", "RIL-229")])
+def test_a_folder_opens_without_a_table_of_another_rate(folder, name, code):
+    rows = {"poses.txt": (folder / "poses.txt").read_text().splitlines()[:2], "times.txt": ["0", "0.1"]}
+    (folder / name).write_text("\n".join(rows[name]))
+    with raises(code, f"rename {folder / name}: the folder opens without it"):
+        open_sequence(str(folder))
+    (folder / name).unlink()
+    assert open_sequence(str(folder)).frames == 3
+
+
 def test_complaints_name_the_line_of_the_file(folder):
     """Also where a blank line, or a frame without images, makes lines and frames differ."""
     for side in ("image_l", "image_r"):

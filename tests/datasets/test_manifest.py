@@ -313,6 +313,17 @@ def test_tables_of_times_of_other_programs(tmp_path, lines):
     assert opened(path).times == (10.0, 10.5, 11.0)
 
 
+@pytest.mark.parametrize(
+    ("step", "unit", "warned"), [(100, "", True), (100, "s", False), (100.5, "", False), (5, "", False)]
+)
+def test_whole_numbers_of_times_that_are_far_apart_may_be_milliseconds(tmp_path, step, unit, warned):
+    write_lines(tmp_path / "times.txt", [str(k * step) for k in range(3)])
+    stated = f'unit = "{unit}"' if unit else ""
+    s = open_manifest(write_sequence(tmp_path, f'[times]\nfile = "times.txt"\n{stated}'), Digests())
+    assert any("RIL-718" in line for line in s.warnings) == warned
+    assert s.times[1] == step
+
+
 def test_the_title_of_a_column_of_times_states_their_unit(tmp_path):
     path = write_sequence(tmp_path, '[times]\nfile = "t.txt"\n')
     write_lines(tmp_path / "t.txt", ["time_ms,image", "0,00.png", "500,01.png", "1000,02.png"])
