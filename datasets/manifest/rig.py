@@ -207,9 +207,16 @@ def _stated(section: RigSection, of_files: RigidTransform | None) -> RigidTransf
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:
     """Refuse a length (m) that looks like one in another unit, or warn about it, unless the unit is stated."""
+    from_files = section.baseline is None and section.T_right_left is None
+    # 1e-3 m: cameras stand no closer, but a unit that the file states counts twice.
+    if baseline < 1e-3 and from_files and section.unit < 1.0:
+        text = (
+            f"the baseline is {baseline:g} m by rig.unit = {section.unit:g}, and {baseline / section.unit:g} m without"
+        )
+        remedy = "leave rig.unit out: the calibration states its unit, or its format defines it"
+        raise InputError("RIL-856", text, remedy=remedy)
     if baseline <= USUAL_BASELINE or "unit" in section.model_fields_set:
         return []
-    from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"

@@ -700,6 +700,15 @@ def test_a_baseline_that_may_be_squares_of_a_chessboard_is_doubted(tmp_path, fil
     assert [line.split(": ")[1] for line in by_name.warnings] == [str(tmp_path / "rover.rille.toml")] * doubted
 
 
+def test_a_unit_that_the_file_and_the_manifest_state_is_not_taken_twice(tmp_path):
+    K, R = "[100, 0, 31.5, 0, 100, 23.5, 0, 0, 1]", "[1, 0, 0, 0, 1, 0, 0, 0, 1]"
+    (tmp_path / "rig.yaml").write_text(f"unit: mm\nK1: {K}\nK2: {K}\nR: {R}\nT: [-97, 0, 0]\n")
+    cameras = '[cameras]\nfile = "rig.yaml"\n'
+    assert opened(write_sequence(tmp_path, cameras=cameras, rig="[rig]\n")).rig.baseline == pytest.approx(0.097)
+    with raises("RIL-856", "9.7e-05 m by rig.unit = 0.001", "leave rig.unit out"):
+        opened(write_sequence(tmp_path, cameras=cameras, rig="[rig]\nunit = 0.001\n"))
+
+
 # -- bad input, one line each ------------------------------------------------------------------------------------------
 
 
