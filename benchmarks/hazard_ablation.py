@@ -2,7 +2,7 @@
 
     benchmarks/hazard_ablation.py --scenes FOLDER [--seeds 20] [--cover 0.05 0.1 0.2]
 
-The scenes and the truth are those of ``benchmarks/hazards.py``: the truth always has all measures. Shares are of
+The scenes and the truth are those of ``benchmarks/hazards.py``: the truth always has all seven measures. Shares are of
 the observed cells.
 """
 

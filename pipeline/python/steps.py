@@ -321,8 +321,8 @@ def hazards(dem: xarray.Dataset, vehicle: Settings | str | Path | None = None, *
         Of each cell (row, col): ``risk``, uint8, 0 safe, 1 caution, 2 hazard, 3 unknown; ``p_hazard`` and ``p_wheel``,
         probabilities that a measure, or one of a wheel's window, exceeds its limit; ``reason``, uint16, bits of the
         exceeded limits; ``filled``, uint8, 1 where a small hole was closed, and ``elevation`` (m) so; the measures
-        ``step``, ``roughness``, ``clearance`` (m), ``inclination``, ``slope`` and ``tilt`` (radians). All others are
-        float32. Coordinates are those of ``dem``.
+        ``height_range``, ``step``, ``roughness``, ``clearance`` (m), ``inclination``, ``slope`` and ``tilt``
+        (radians). All others are float32. Coordinates are those of ``dem``.
 
     Raises
     ------

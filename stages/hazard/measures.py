@@ -2,10 +2,9 @@
 
 To add a measure, write its kernel, ``(HazardInput) -> array``, and add its row: classification, reasons, raster,
 messages and the probability of a hazard loop over the table. Inputs are an elevation model with its standard deviations
-and the vehicle; outputs are metres or gradients, float32 without NaN. Inclination and step are measures of the paper
+and the vehicle; outputs are metres or gradients, float32 without NaN. The first three measures are those of the paper
 (section 4.6), by running extrema over octagons (:mod:`rille.stages.numeric.extrema`); the last three place the vehicle
-at every position and heading (:mod:`rille.stages.hazard.placement`). The paper's height range is the inclination times
-the window's extent, and no cell is hazardous by it alone. Roughness is the RMS deviation
+at every position and heading (:mod:`rille.stages.hazard.placement`). Roughness is the RMS deviation
 ``sqrt(mean((z(x + d) - z(x))^2) / 2)`` over both axes: on level ground the standard deviation of the heights, and it
 increases little with slope (Shepard et al. 2001, doi:10.1029/2000JE001429).
 
@@ -169,6 +168,10 @@ MEASURES = (
         length=lambda t: t.extent,
     ),
     Measure(
+        "range", 1 << 1, lambda t: t.relief[1], "clearance", 0.05, 0.8, "height range", "height_range",
+        "highest minus lowest height in the wheel's window",
+    ),
+    Measure(
         "step", 1 << 2, lambda t: t.relief[0], "max_step", 0.05, 0.9, "step", "step",
         "highest minus lowest height within a wheel's radius",
     ),
@@ -191,8 +194,7 @@ MEASURES = (
         "least height left under the belly, over headings", on_blocks=True, below=True, left=True,
     ),
 )  # fmt: skip
-"""All measures. Of the bits of ``reason``, 1 << 1 (the height range of former versions) and 1 << 7 to 1 << 10
-(:mod:`rille.stages.hazard.classification`) are taken."""
+"""All measures. Bits 1 << 7 to 1 << 10 of ``reason`` are taken (:mod:`rille.stages.hazard.classification`)."""
 
 BITS = {m.name: m.bit for m in MEASURES}
 WHEEL_BITS = np.uint16(sum(m.bit for m in MEASURES if not m.below))

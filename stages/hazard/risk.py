@@ -80,8 +80,8 @@ def risk_map(
     Returns
     -------
     ``risk`` uint8 (0 safe, 1 caution, 2 hazard, 3 unknown), ``reason`` uint16 bits; float32, NaN where unknown:
-    ``inclination``, ``slope``, ``tilt`` rad, ``step``, ``roughness``, ``clearance`` (left under the belly) m,
-    ``p_hazard``, ``p_wheel``; ``filled`` uint8, ``elevation`` float32 m (closed).
+    ``inclination``, ``slope``, ``tilt`` rad, ``height_range``, ``step``, ``roughness``, ``clearance`` (left under the
+    belly) m, ``p_hazard``, ``p_wheel``; ``filled`` uint8, ``elevation`` float32 m (closed).
 
     Raises
     ------
@@ -141,7 +141,7 @@ def window_cells(side: float, cell: float) -> int:
 def risk_stage(
     params: RiskParams, dem: Sequence[Bundle], *, vehicle: Vehicle = DEFAULT_VEHICLE, use: str | None = None
 ) -> Bundle[RiskFacts]:
-    """Safe, caution, hazard and unknown cells by six measures against a vehicle's limits.
+    """Safe, caution, hazard and unknown cells by seven measures against a vehicle's limits.
 
     ``use``: "local" for the map of one pair of a run, which is unknown throughout where the vehicle does not fit on it.
     """

@@ -53,7 +53,9 @@ def test_a_post_on_coarse_ground_by_hand() -> None:
     np.testing.assert_array_equal((out["reason"] & BITS["step"]) > 0, near)
     np.testing.assert_array_equal((out["reason"] & BITS["inclination"]) > 0, near)
     np.testing.assert_allclose(out["step"][near], 0.02, rtol=1e-6)
+    np.testing.assert_allclose(out["height_range"][near], 0.02, rtol=1e-6)
     np.testing.assert_allclose(out["inclination"][near], math.pi / 4, rtol=1e-6)
+    assert (out["reason"] & BITS["range"]).max() == 0
     # at the post: of the pairs of neighbours that begin or end in nine cells, four differ by 20 mm, each counted twice
     assert out["roughness"][15, 15] == pytest.approx(math.sqrt(0.5 * 8 * 0.02**2 / 36), rel=1e-5)
     assert out["clearance"][15, 15] == pytest.approx(0.01, rel=1e-5)
@@ -81,7 +83,7 @@ def test_a_slope_is_judged_alike_in_all_directions(direction: float, slope_deg: 
         assert 1.0 - 1e-3 <= found.min() <= found.max() <= 1.04
     assert (out["risk"][inner] == HAZARDOUS).all() == hazardous
     # over a wheel's radius this slope rises 0.37 * 14 mm * 1.09 = 5.8 mm, no step; under the belly 12 of 30 mm
-    assert (out["reason"] & (BITS["step"] | BITS["rise"])).max() == 0
+    assert (out["reason"] & (BITS["step"] | BITS["range"] | BITS["rise"])).max() == 0
 
 
 @pytest.mark.parametrize(("height", "hazardous"), [(0.014, False), (0.016, True)])
@@ -250,7 +252,7 @@ def test_raising_what_stands_highest_never_makes_a_cell_safer(seed: int, lift: i
     both = before["risk"] != UNKNOWN
     if not holes:
         assert (after["p_hazard"][both] >= before["p_hazard"][both]).all()
-    for name in ("inclination", "step", "roughness", "tilt", "slope"):
+    for name in ("inclination", "height_range", "step", "roughness", "tilt", "slope"):
         assert (after[name][both] >= before[name][both] - 1e-6).all(), name
     assert (after["clearance"][both] <= before["clearance"][both] + 1e-6).all()
 
