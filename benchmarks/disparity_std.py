@@ -46,9 +46,8 @@ def rendered(cache: Path, parameters: dict[str, Any], frame: int) -> tuple[Any, 
     """Left and right image, the exact column disparity, and both images' masks, of one mockup pair."""
     from rille.datasets.mockup.params import MockupParams
     from rille.datasets.mockup.sequence import mockup
-    from rille.pipeline.engine.spec import Spec
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.engine.task import ensure
+    from rille.pipeline.engine.task import Spec, ensure
 
     store, sequence = Store(cache), mockup(MockupParams(**parameters))
 

@@ -27,7 +27,7 @@ CELLS = 1500
 LIMIT = 1 << 30
 
 
-@stage("synthetic_dem", outputs=[raster(n, "m", n) for n in ("elevation", "elevation_std", "residual", "ortho")])
+@stage("synthetic_dem", outputs=[raster(n, "m", n) for n in ("elevation", "elevation_std", "ortho")])
 def synthetic_dem(params: NoParams, *, pair: int, i0: int, j0: int, cells: int) -> Bundle:
     """A model: waves, noise of its own, and a border that is not straight."""
     lattice = Lattice.at(i0, j0, 0.01, cells, cells)
@@ -36,7 +36,7 @@ def synthetic_dem(params: NoParams, *, pair: int, i0: int, j0: int, cells: int) 
     z = np.sin(x) * np.cos(y) + rng.normal(0, 0.01, lattice.shape).astype(np.float32)
     z[np.abs(x - x.mean()) + 0.2 * np.abs(y - y.mean()) > 0.5 * np.ptp(x)] = np.nan
     even = np.ones(lattice.shape, np.float32)
-    maps = {"elevation": z, "elevation_std": 0.01 * even, "residual": 0.05 * even, "ortho": np.rint(100 + 50 * z)}
+    maps = {"elevation": z, "elevation_std": 0.01 * even, "ortho": np.rint(100 + 50 * z)}
     return Bundle(maps, {"pair": pair, "lattice": lattice.to_dict(), "frame": "world"})
 
 

@@ -268,8 +268,8 @@ class Watch(threading.Thread):
 
 def measure(pairs: int, cache: str, executor: str, jobs: int, what: str) -> dict[str, Any]:
     """One cold run, one plan of what is cached, or one warm run a day later, in this process."""
-    from rille.pipeline.engine.code_digest import tree_digest
     from rille.pipeline.engine.events import read
+    from rille.pipeline.engine.keys import tree_digest
     from rille.pipeline.engine.run import RunOptions, run
     from rille.pipeline.engine.store.base import Store
 

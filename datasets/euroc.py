@@ -19,7 +19,7 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.images.files import Digests
 from rille.datasets.images.pairing import stamp_of
 from rille.datasets.manifest.model import Cameras, Images, Imu, Manifest, Times, Truth
-from rille.datasets.manifest.opening import open_described
+from rille.datasets.manifest.opening import open_folder
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name
 from rille.stages.core.errors import InputError, warning
@@ -67,7 +67,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         imu=imu,
         defaults={"locus.cell_size": 0.05},
     )
-    sequence = open_described(manifest, folder, str(folder), digests, [folder / name for name in (*TRUTH, IMU)])
+    sequence = open_folder(manifest, folder, digests, [folder / name for name in (*TRUTH, IMU)])
     return replace(sequence, warnings=(*sequence.warnings, *warnings))
 
 

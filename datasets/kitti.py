@@ -16,7 +16,7 @@ from pathlib import Path
 from rille.datasets.cameras import read_cameras
 from rille.datasets.images.files import SUFFIXES, Digests
 from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth, stated_vehicle
-from rille.datasets.manifest.opening import open_described
+from rille.datasets.manifest.opening import open_folder
 from rille.datasets.manifest.rig import CAR, STREET
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name, shell_word
@@ -67,8 +67,8 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
         remedy = f"`rille init {shell_word(path)}` writes a manifest that says what is needed"
         raise InputError("RIL-278", text, remedy=remedy)
     manifest = manifest_of(folder, sides)
-    spare = [folder / of.file for of in (manifest.truth, manifest.times) if of is not None and of.file]
-    sequence = open_described(manifest, folder, str(folder), digests, spare)
+    spare = [folder / "times.txt", *([Path(manifest.truth.file)] if manifest.truth else [])]
+    sequence = open_folder(manifest, folder, digests, spare)
     return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
 
 

@@ -7,7 +7,7 @@ import tempfile
 from typing import Any
 
 from rille.pipeline.cli import app as commands
-from rille.pipeline.engine.packages import installed
+from rille.pipeline.engine.keys import installed
 
 FAST = "RILLE_DOCS_FAST" in os.environ
 """Whether examples are shown and not executed."""

@@ -53,7 +53,7 @@ def _versions() -> str:
     """Version of the program, of what its results depend on, and the machine's kind; one a line."""
     import platform
 
-    from rille.pipeline.engine.packages import installed
+    from rille.pipeline.engine.keys import installed
 
     versions = installed() | {"system": f"{platform.system()} {platform.machine()}"}
     return "\n".join(f"{name:24s} {version}" for name, version in versions.items())
@@ -89,6 +89,9 @@ app = program()
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of ``rille``."""
+    if argv is None and sys.getfilesystemencoding() != "utf-8":
+        # Names of files are in UTF-8 in any locale; in that of ASCII they could be neither printed nor written.
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
     with plain_output():
         try:
             code = _run(argv)
@@ -102,12 +105,11 @@ def main(argv: list[str] | None = None) -> None:
 
 def prepare() -> None:
     """One thread a library, safe kernels, and nothing of the current folder, before NumPy and numba are imported."""
-    from rille.pipeline.engine.runtime import apart
-    from rille.pipeline.engine.runtime.environment import prepare_environment
+    from rille.pipeline.engine.runtime import environment
 
-    prepare_environment()
-    apart.leave_out()
-    apart.ignore_settings()
+    environment.prepare_environment()
+    environment.leave_out()
+    environment.ignore_settings()
 
 
 def _run(argv: list[str] | None) -> int:

@@ -39,9 +39,6 @@ def _unraisable(what: "sys.UnraisableHookArgs") -> None:
 
 def main() -> None:
     """Run ``rille`` with the words of the command line."""
-    if sys.getfilesystemencoding() != "utf-8" and os.environ.get("PYTHONUTF8") != "1":
-        # Else no file that names another one could be written: once more, as Python does by itself in locale C.
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | {"PYTHONUTF8": "1"})
     # A shell lets what it starts in the background ignore Ctrl-C.
     heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:

@@ -22,8 +22,8 @@ from rille.pipeline.engine import provenance
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.keys import digest
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import Ref
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.stages.core.declare import Params

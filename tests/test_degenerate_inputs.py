@@ -18,8 +18,8 @@ import pytest
 
 import rille
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.spec import Spec, map_ports
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
+from rille.pipeline.engine.store.arrays import array_digests, output_digest
+from rille.pipeline.engine.task import Spec, map_ports
 from rille.pipeline.runs import run_files, session
 from rille.stages.core.declare import AnyArray, Array, Bundle, Stage, check_outputs
 from rille.stages.core.errors import DegenerateError

@@ -18,7 +18,7 @@ from dry_chain import Chain, candidates, downstream, group, laid_out, short, sta
 
 from rille.datasets.images.misalign import MisalignParams
 from rille.datasets.mockup.params import SHORT, MockupParams
-from rille.pipeline.engine import code_digest, spec
+from rille.pipeline.engine import keys, task
 from rille.pipeline.engine.graph import Handle
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
@@ -157,7 +157,7 @@ def edited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     folder = tmp_path_factory.mktemp("sources")
     for package in ("stages", "datasets", "pipeline"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = (code_digest._read, code_digest._file, code_digest.module_digests, spec._shared, spec._shared_digest)
+    caches = (keys._read, keys._file, keys.module_digests, task._shared, task._shared_digest)
 
     @contextmanager
     def edit(module: str, change: Callable[[str], str]) -> Iterator[None]:
@@ -170,7 +170,7 @@ def edited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         path.write_text(text)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(code_digest, "_roots", lambda package: (folder / package.removeprefix("rille."),))
+        patch.setattr(keys, "_roots", lambda package: (folder / package.removeprefix("rille."),))
         yield edit
     for cached in caches:
         cached.cache_clear()

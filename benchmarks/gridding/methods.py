@@ -1,7 +1,8 @@
 """Ways from a disparity map to an elevation model, behind one interface, with the same filters.
 
-All of them take the same pixels: measured, matched back to within the same limit, within the same distance of the
-epipolar line, in no bilinear cell with a jump beyond Locus' own limit, within the same range of elevations.
+All of them take the same pixels: measured, matched back to within the same limit, in no bilinear cell with a jump
+beyond Locus' own limit, within the same range of elevations; points, beside Locus, within half a pixel of the epipolar
+line.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from .scenes import Scene, pixels_of
 Floats = NDArray[np.float64]
 DEFAULT = LocusParams()
 MAX_BACKMATCH_PX = 1.0
+MAX_OFF_LINE_PX = 0.5
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def _judge(
     across = np.abs(off[:, 0] * e[:, 1] - off[:, 1] * e[:, 0])
     moved = np.abs(np.sum((far - near) * e, axis=1))
     rise = np.abs((rays @ scene.T_local_left.rotation.T)[:, 2]) * 0.001 * np.abs(depth)
-    return (depth > 0) & (across <= DEFAULT.max_residual), rise / np.maximum(moved, 1e-12)
+    return (depth > 0) & (across <= MAX_OFF_LINE_PX), rise / np.maximum(moved, 1e-12)
 
 
 def _corner_of(quads: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rille.datasets.mockup.params import MockupParams
 from rille.datasets.mockup.sequence import mockup
 from rille.datasets.protocol import Source
-from rille.pipeline.engine.spec import resolve
+from rille.pipeline.engine.task import resolve
 from rille.pipeline.flow import config
 from rille.stages.core.validity import matched_back
 from rille.stages.geometry.geometry import Rig, RigidTransform

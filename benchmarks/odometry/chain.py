@@ -126,7 +126,7 @@ class Chain:
         given: dict[str, Any] = {"segments": [r for r, _ in segments], "levels": [level for _, level in segments]}
         if self.config.resect.joint:
             args: dict[str, Any] = {"before": self.corrections[-1]} if self.corrections else {}
-            args["fixed"] = self.config.rig.mode == "fixed"
+            args |= {"given": self.sequence.rig.to_dict(), "fixed": self.config.rig.mode == "fixed"}
             found = self._stage("intrinsics", args, segments=given["segments"], rig=self.calibration)
             given["intrinsics"] = found
             if any(found.meta["correction"]) and len(self.corrections) < MAX_CALIBRATIONS:

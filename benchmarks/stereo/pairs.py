@@ -180,9 +180,8 @@ def _data(name: str) -> Path | None:
 
 def fetcher(cache: Path) -> Callable[[Any], Any]:
     """Function that computes a source once and then reads it from the cache."""
-    from rille.pipeline.engine.spec import Spec
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.engine.task import ensure
+    from rille.pipeline.engine.task import Spec, ensure
 
     def artifact(source: Any) -> Any:
         refs = {port: artifact(upstream) for port, upstream in source.inputs.items()}

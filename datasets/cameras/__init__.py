@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -25,11 +25,10 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
-    "camodocal, VINS, Basalt, mrcal, DSO, MRPT, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
-    "COLMAP, Middlebury calib.txt, KITTI, DSEC, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, "
-    "CAHVORE) are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; "
-    "MATLAB's K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of "
-    "view / 2)"
+    "camodocal, VINS, Basalt, mrcal, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
+    "COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) "
+    "are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's "
+    "K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -46,9 +45,8 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (states(r"cam0[ \t]*=[ \t]*\["), makers.middlebury),
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
-    (makers.has_section("LEFT_CAM_"), makers.zed),
-    (makers.has_section(makers.OF_RIGHT), makers.mrpt),
-    (lambda text: slam.DSO.search(text) is not None, slam.dso),
+    (lambda text: "[LEFT_CAM_" in text, makers.zed),
+    (lambda text: f"{makers.MRPT}]" in text, makers.mrpt),
     (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),
@@ -59,7 +57,6 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
-    (lambda f: isinstance(of := f.values.get("extrinsics"), Mapping) and "T_10" in of, slam.dsec),
     (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),
@@ -72,6 +69,7 @@ NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[Cali
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
     (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
     (lambda f: "value0" in f, slam.basalt),
+    (lambda f: "camRect0" in f.sub("intrinsics") if "intrinsics" in f else False, slam.dsec),
     (makers.has_figures, makers.figures),
 )
 """Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are

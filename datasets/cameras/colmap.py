@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.text.reading import read_text
@@ -72,10 +70,10 @@ def _rig(path: Path) -> dict[str, RigidTransform]:
         if known == "0":
             continue
         f = Fields({"pose": rest[:7]}, str(path), f"sensor {number} ")
-        w, x, y, z, *t = f.numbers("pose", 7)
+        wxyz = f.numbers("pose", 7)
         rest = rest[7:]
         if kind == "CAMERA":
-            poses[number] = RigidTransform(f.quaternion("pose", (x, y, z, w)), np.array(t))
+            poses[number] = f.by_quaternion("pose", wxyz[:4], wxyz[4:])
     return poses
 
 

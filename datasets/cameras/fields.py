@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from rille.datasets.cameras.model import UNKNOWN_SIZE
-from rille.datasets.cameras.text import parse_nested
+from rille.datasets.cameras.text import entries, parse_nested
 from rille.datasets.text.reading import GREATEST, read_text
-from rille.datasets.text.units import LENGTHS, unit_of
+from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import Camera, RigidTransform
@@ -55,7 +55,7 @@ COEFFICIENT = re.compile(
 
 TURN = re.compile(
     r"(?:left_|right_)?"
-    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*)",
+    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|q|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*)",
     re.I,
 )
 """Keys that say how a camera is turned."""
@@ -83,6 +83,12 @@ class Fields:
     def read(path: Path) -> Fields:
         """Entries of a file of its own beside a calibration."""
         return Fields(parse_nested(read_text(path, "calibration"), str(path)), str(path))
+
+    @staticmethod
+    def of_lines(lines: Iterable[tuple[str, str]], file: str, at: str = "") -> Fields:
+        """Entries of lines of key and value, which is a list if it has several words, perhaps in brackets."""
+        rows = ((key, value.partition("//")[0].strip(" []").replace(";", " ").split()) for key, value in lines if key)
+        return Fields(entries(((key, row if row[1:] else "".join(row)) for key, row in rows), file), file, at)
 
     def __contains__(self, key: str) -> bool:
         return self.values.get(key) is not None
@@ -155,17 +161,25 @@ class Fields:
                 raise self.error("RIL-122", key, f"= {value:g} is no image size in pixels")
         return int(width), int(height)
 
-    def metres(self, key: str) -> float:
-        """Length of the unit that a key's name, or else the entry ``unit`` or ``units`` states; 1 if none does."""
-        stated = unit_of(key) or unit_of(f"[{self.values.get('unit', self.values.get('units', ''))}]")
-        return LENGTHS.get(stated, 1.0)
-
     def transform(self, rotation: str, translation: str) -> RigidTransform:
-        """Rigid transform from a 3 x 3 matrix and three numbers, by :meth:`metres`."""
+        """Rigid transform from a 3 x 3 matrix and three numbers."""
         if rotation not in self:
             self.check_turn()  # it may stand there in another form
-        t = np.array(self.numbers(translation, 3)) * self.metres(translation)
-        return self.rigid(rotation, self.matrix(rotation, 3, 3), t)
+        return self.rigid(rotation, self.matrix(rotation, 3, 3), np.array(self.numbers(translation, 3)))
+
+    def by_quaternion(self, key: str, wxyz: Sequence[float], translation: Sequence[float]) -> RigidTransform:
+        """Rigid transform of a quaternion, the scalar first, and three numbers; ``key``: of these, for errors."""
+        from scipy.spatial.transform import Rotation
+
+        if abs(np.linalg.norm(wxyz) - 1) > 0.01:
+            raise self.error("RIL-767", key, f"have length {np.linalg.norm(wxyz):.4g}, it should be 1")
+        # SciPy has the scalar last.
+        return self.rigid(key, Rotation.from_quat(np.roll(wxyz, -1)).as_matrix(), np.array(translation))
+
+    @property
+    def unit(self) -> float:
+        """Metres of the unit of length that an entry states, as ``unit: mm``; 1 if none does."""
+        return LENGTHS.get(unit_of(f"[{self.text(self.spelt(('unit', 'units', 'length_unit')), '')}]"), 1.0)
 
     def pose(self, key: str) -> RigidTransform:
         """Rigid transform from a 4 x 4 or 3 x 4 matrix."""
@@ -274,7 +288,7 @@ class Fields:
             numbers = flattened(value) or [value]
             # 16: of a 4 x 4 matrix; more are of the views of a chessboard.
             turns = isinstance(value, Mapping) or (len(numbers) <= 16 and _any_but_zero(numbers))
-            of_camera = (turns and TURN.fullmatch(key)) or (_is_rotation(numbers) and not SENSOR.search(key))
+            of_camera = (turns and TURN.fullmatch(unitless(key))) or (_is_rotation(numbers) and not SENSOR.search(key))
             if of_camera and self.at + key not in self.used:
                 remedy = "state it as R, a 3 x 3 matrix, with T (m), x_right = R x_left + T; or remove it"
                 raise self.error("RIL-766", key, "seems to turn a camera, and is not read there", remedy)
@@ -288,15 +302,6 @@ class Fields:
         if not abs(number) < GREATEST:
             raise self.error("RIL-121", key, f"is {_shown(value)}, it should be a number below {GREATEST:g}")
         return number
-
-    def quaternion(self, key: str, xyzw: Sequence[float]) -> Floats:
-        """Rotation matrix of the unit quaternion at ``key``, its scalar last."""
-        from scipy.spatial.transform import Rotation
-
-        length = float(np.linalg.norm(xyzw))
-        if abs(length - 1) > 0.01:
-            raise self.error("RIL-767", key, f"is a quaternion of length {length:.4g}, it should be 1")
-        return np.asarray(Rotation.from_quat(xyzw).as_matrix(), np.float64)
 
     def rigid(self, key: str, rotation: Floats, translation: Floats) -> RigidTransform:
         """Rigid transform of the numbers at ``key``."""

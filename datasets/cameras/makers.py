@@ -1,13 +1,13 @@
 """Calibrations of stereo cameras and data sets by their makers.
 
-ZED's ``.conf``, MRPT's ``.ini`` (Malaga), OAK's JSON (DepthAI), RealSense's list, ``K.txt``, Middlebury's rectified
-pairs (2014 and 2021), and figures by key.
+ZED's ``.conf``, OAK's JSON (DepthAI), RealSense's list, ``K.txt``, Middlebury's rectified pairs (2014 and 2021), and
+figures by key.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,32 +17,19 @@ from rille.datasets.cameras.fields import Fields, by_count
 from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.cameras.opencv import relative
-from rille.datasets.cameras.text import assignments, entries, words
+from rille.datasets.cameras.text import assignments, entries
 from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.units import unitless
+from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
-SIDES = ("LEFT", "RIGHT")
+SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]((?:.*\n(?![ \t]*\[))*.*)", re.MULTILINE)
+ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
+"""Of a ``.conf``: a section with its text, and one of its entries."""
 
-SECTION = re.compile(r"^[ \t]*\[(\w{1,60})\].*$", re.MULTILINE)
-ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\[[^\]\n]*\]|\S+)", re.MULTILINE)
-"""Of a ``.conf`` or ``.ini``: the head of a section, and one of its entries, a word or a list in brackets."""
-
-
-def _sections(text: str, path: Path) -> Callable[[str], Fields]:
-    """Entries of a section by its name in capitals, by keys in small letters; none of one that is not there."""
-    _, *parts = SECTION.split(text)
-    named = zip(parts[::2], map(ENTRY.findall, parts[1::2]), strict=True)
-    found = {name.upper(): entries(((k.lower(), words(v)) for k, v in rows), f"{path} {name}") for name, rows in named}
-    return lambda name: Fields(found.get(name, {}), str(path), f"{name} ")
-
-
-def has_section(part: str) -> Callable[[str], bool]:
-    """Whether a text has a section with this part of a name."""
-    return lambda text: any(part in name.upper() for name in SECTION.findall(text))
-
+MRPT = "_LEFT2RIGHT_POSE"
+"""End of the name of a section of MRPT's."""
 
 ZED_SIZES = {
     "VGA": (672, 376),
@@ -64,14 +51,20 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     rotation vector of R (``saveCalibZED`` of Stereolabs' calibration tool). With several resolutions each has its size;
     the size of a single one is that of the images.
     """
-    parts = _sections(text, path)
-    heads = dict.fromkeys(map(str.upper, SECTION.findall(text)))
-    names = [name.removeprefix("LEFT_CAM_") for name in heads if name.startswith("LEFT_CAM_")]
-    stereo = parts("STEREO")
+    parts = {
+        name.upper(): entries(((k.lower(), v) for k, v in ENTRY.findall(body)), f"{path} {name}")
+        for name, body in SECTION.findall(text)
+    }
+    names = [name.removeprefix("LEFT_CAM_") for name in parts if name.startswith("LEFT_CAM_")]
+    stereo = Fields(parts.get("STEREO", {}), str(path), "STEREO ")
     cameras = []
     for name in names:
         size = ZED_SIZES.get(name, UNKNOWN_SIZE) if len(names) > 1 else UNKNOWN_SIZE
-        left, right = (_zed_lens(parts(f"{side}_CAM_{name}"), parts(f"{side}_DISTO"), size) for side in SIDES)
+        # Newer files have one distortion for all resolutions.
+        left, right = (
+            _zed_lens(Fields(parts.get(f"{side}_DISTO", {}) | parts.get(at, {}), str(path), f"{at} "), size)
+            for side, at in (("LEFT", f"LEFT_CAM_{name}"), ("RIGHT", f"RIGHT_CAM_{name}"))
+        )
         rx, cv, rz, ty, tz = (
             stereo.number(f"{key}_{name.lower()}", stereo.number(key, 0.0)) for key in ("rx", "cv", "rz", "ty", "tz")
         )
@@ -81,29 +74,25 @@ def zed(text: str, path: Path) -> list[CalibratedCamera]:
     return cameras
 
 
-def _zed_lens(camera: Fields, distortion: Fields, size: tuple[int, int]) -> Lens:
-    # Newer files have one distortion for all resolutions.
-    f = Fields({**distortion.values, **camera.values}, camera.file, camera.at)
+def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
     lens = f.optics("fx fy cx cy", size, "fisheye" if "k4" in f and "p1" not in f else "rational")
     f.check_lens()
     return lens
 
 
-OF_RIGHT = "LEFT2RIGHT_POSE"
-"""End of the name of MRPT's section with the pose of the right camera in the left one's frame."""
-
-
 def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
-    """Both cameras of MRPT's stereo calibration (Malaga's data sets); lengths are metres."""
-    parts = _sections(text, path)
-    prefix = next(name.upper() for name in SECTION.findall(text) if OF_RIGHT in name.upper()).removesuffix(OF_RIGHT)
-    placed, of_sides = parts(prefix + OF_RIGHT), [parts(prefix + side) for side in SIDES]
-    cameras = (f.optics("fx fy cx cy", f.size("resolution"), "none").camera for f in of_sides)
-    left, right = [f.distorted("dist", camera) for f, camera in zip(of_sides, cameras, strict=True)]
-    for f in of_sides:
-        f.check_lens()
-    x, y, z, qw, qx, qy, qz = placed.numbers("pose_quaternion", 7)
-    T_left_right = RigidTransform(placed.quaternion("pose_quaternion", (qx, qy, qz, qw)), np.array([x, y, z]))
+    """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set.
+
+    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose
+    of the right camera in the left one's frame, metres.
+    """
+    parts = {name: Fields.of_lines(assignments(body), str(path), f"{name} ") for name, body in SECTION.findall(text)}
+    whole = next(name for name in parts if name.endswith(MRPT)).removesuffix(MRPT)
+    names = (whole + end for end in (MRPT, "_LEFT", "_RIGHT"))
+    pose, *sides = (parts.get(name) or Fields({}, str(path), f"{name} ") for name in names)
+    left, right = (f.distorted("dist", f.optics("fx fy cx cy", f.size("resolution"), "none").camera) for f in sides)
+    numbers = pose.numbers("pose_quaternion", 7)
+    T_left_right = pose.by_quaternion("pose_quaternion", numbers[3:], numbers[:3])
     return stereo_cameras(left, right, T_left_right.inverse())
 
 
@@ -177,13 +166,13 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
 
 def numbers_of_matrix(text: str) -> list[str]:
     """The nine numbers fx 0 cx, 0 fy cy, 0 0 1 of a text, and perhaps a tenth; empty for any other text."""
-    numbers = re.sub(r"[\[\],;]", " ", text[:1000]).split()
+    words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
     try:
-        k = [float(word) for word in numbers[:9]]
+        k = [float(word) for word in words[:9]]
     except ValueError:
         return []
-    fits = len(numbers) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
-    return numbers if fits else []
+    fits = len(words) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
+    return words if fits else []
 
 
 def matrix(text: str, path: Path) -> list[CalibratedCamera]:
@@ -244,12 +233,12 @@ def figures(f: Fields, path: Path) -> list[CalibratedCamera]:
 def beside(f: Fields) -> RigidTransform | None:
     """T_right_left of parallel cameras by a ``baseline``, metres or the unit in its key; None if there is none."""
     keys = [key for key in f.values if unitless(key).lower() == "baseline" and key in f]
-    return parallel(f.number(keys[0]) * f.metres(keys[0])) if len(keys) == 1 else None
+    return parallel(f.number(keys[0]) * LENGTHS.get(unit_of(keys[0]), f.unit)) if len(keys) == 1 else None
 
 
 def middlebury(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras; the file's baseline is in millimetres, here in metres."""
-    f = Fields(entries(((key, words(value)) for key, value in assignments(text) if key), str(path)), str(path))
+    f = Fields.of_lines(assignments(text), str(path))
     size = f.size("width", "height")
     left, right = (Lens(f.pinhole(key, size)) for key in ("cam0", "cam1"))
     f.check_lens()

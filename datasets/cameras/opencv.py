@@ -12,7 +12,6 @@ from rille.datasets.cameras.fields import Fields, flattened
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.images.pairing import side_of
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.units import unitless
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -75,16 +74,16 @@ def stereo(f: Fields, path: Path) -> list[CalibratedCamera]:
     keys = enumerate(sides(f), start=1)
     lenses = [f.distorted(distortion, f.pinhole(matrix, _size(f, str(k)))) for k, (matrix, distortion) in keys]
     poses: tuple[RigidTransform | None, RigidTransform | None] = None, None
-    rig = f if placed(f) else _beside(path) or f
+    placed = f if f.has(*POSE) else _beside(path) or f
     if "RIGHT.P" in f and "LEFT.R" in f:
         poses = _unrectified(f, "LEFT.R", "LEFT.P"), _unrectified(f, "RIGHT.R", "RIGHT.P")
-    elif placed(rig):
-        poses = RigidTransform.identity(), relative(rig)
-    elif all(key in rig for key in ("R1", "P1", "R2", "P2")):  # of stereoRectify
-        poses = _unrectified(rig, "R1", "P1"), _unrectified(rig, "R2", "P2")
+    elif placed.has(*POSE):
+        poses = RigidTransform.identity(), relative(placed)
+    elif all(key in placed for key in ("R1", "P1", "R2", "P2")):  # of stereoRectify
+        poses = _unrectified(placed, "R1", "P1"), _unrectified(placed, "R2", "P2")
     found = [CalibratedCamera(name, lens, T) for name, lens, T in zip(("left", "right"), lenses, poses, strict=True)]
     projections = ("LEFT.P", "RIGHT.P") if "RIGHT.P" in f else ("P1", "P2")
-    return [_with_rectified(camera, rig, projection) for camera, projection in zip(found, projections, strict=True)]
+    return [_with_rectified(camera, placed, projection) for camera, projection in zip(found, projections, strict=True)]
 
 
 def by_side(f: Fields) -> Fields:
@@ -101,7 +100,7 @@ def stereo_by_side(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 def projections_alone(f: Fields) -> bool:
     """Whether these are P1 and P2 of OpenCV's ``stereoRectify`` without the rig before rectification."""
-    return "P1" in f and "P2" in f and not placed(f)
+    return "P1" in f and "P2" in f and not f.has(*POSE)
 
 
 def projections(f: Fields, path: Path) -> list[CalibratedCamera]:
@@ -182,18 +181,11 @@ def _size(f: Fields, side: str = "") -> tuple[int, int]:
 
 
 def relative(f: Fields) -> RigidTransform | None:
-    """T_right_left, stated as such or by R and T; None if there is none."""
-    if WHOLE in f:
-        return f.pose(WHOLE)
-    if not placed(f):
+    """T_right_left, metres, stated as such or by R and T; None if there is none."""
+    if not f.has(*POSE):
         return None
-    named = next((key for key in f.values if unitless(key) in TRANSLATIONS), TRANSLATIONS[0])
-    return f.transform(f.spelt(ROTATIONS), named)
-
-
-def placed(f: Fields) -> bool:
-    """Whether there is a part of the pose of the right camera; T may have its unit behind it."""
-    return any(unitless(key) in POSE and key in f for key in f.values)
+    T = f.pose(WHOLE) if WHOLE in f else f.transform(f.spelt(ROTATIONS), f.spelt(TRANSLATIONS))
+    return RigidTransform(T.rotation, T.translation * f.unit)
 
 
 def _beside(path: Path) -> Fields | None:

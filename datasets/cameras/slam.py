@@ -1,5 +1,4 @@
-"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, mrcal, DSO,
-and of data sets: DSEC, 4Seasons, VBR, OpenLORIS."""
+"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt and mrcal."""
 
 from __future__ import annotations
 
@@ -10,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rille.datasets.cameras.fields import Fields, flattened
+from rille.datasets.cameras.fields import Fields, by_count, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.images.pairing import natural
-from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -59,7 +57,10 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
     for part, T in zip(parts, poses, strict=True):
         if T is None:
             part.check_turn()
-    return [CalibratedCamera(name, _pinhole_lens(part), T) for name, part, T in zip(names, parts, poses, strict=True)]
+    return [
+        CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)
+        for name, part, T in zip(names, parts, poses, strict=True)
+    ]
 
 
 def _of_body(part: Fields) -> RigidTransform | None:
@@ -107,48 +108,27 @@ def basalt(f: Fields, path: Path) -> list[CalibratedCamera]:
     found = []
     for k in cameras.values:
         camera, pose = cameras.sub(k), poses.sub(k)
-        kind, q = camera.text("camera_type"), [pose.number(f"q{axis}") for axis in "xyzw"]
+        kind, q = camera.text("camera_type"), [pose.number(f"q{axis}") for axis in "wxyz"]
         if kind not in BASALT:
             raise camera.error("RIL-768", "camera_type", f"= {kind} is not read", f"calibrate as {' or '.join(BASALT)}")
         lens = camera.sub("intrinsics").optics("fx fy cx cy", sizes.size(k), BASALT[kind])
-        R, t = pose.quaternion("qx, qy, qz, qw", q), np.array([pose.number(f"p{axis}") for axis in "xyz"])
-        found.append(CalibratedCamera(f"cam{k}", lens, RigidTransform(R, t).inverse()))
+        T = pose.by_quaternion("qx, qy, qz, qw", q, [pose.number(f"p{axis}") for axis in "xyz"])
+        found.append(CalibratedCamera(f"cam{k}", lens, T.inverse()))
     return found
 
 
 def dsec(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Cameras of DSEC: ``T_10`` maps camera 0 to camera 1, ``R_rect0`` camera 0 to its rectified one, ``camRect0``."""
-    optics, placed = f.sub("intrinsics"), f.sub("extrinsics")
-    T, found = RigidTransform.identity(), list[CalibratedCamera]()
-    for k, name in enumerate(sorted(key for key in optics.values if re.fullmatch(r"cam\d", key))):
+    """Cameras of DSEC's ``cam_to_cam.yaml``: ``T_10`` maps camera 0 to camera 1, metres, and so on, and ``R_rect1``
+    camera 1 to that of its rectified images, ``camRect1``."""
+    stated, placed, found = f.sub("intrinsics"), f.sub("extrinsics"), list[CalibratedCamera]()
+    T = RigidTransform.identity()
+    for k in range(len([key for key in stated.values if re.fullmatch(r"cam\d", key)])):
         T = placed.pose(f"T_{k}{k - 1}") @ T if k else T
-        camera = CalibratedCamera(name, _pinhole_lens(optics.sub(name)), T)
-        if f"camRect{k}" in optics:
-            turned = placed.rigid(f"R_rect{k}", placed.matrix(f"R_rect{k}", 3, 3), np.zeros(3)) @ T
-            ideal = CalibratedCamera(f"camRect{k}", _pinhole_lens(optics.sub(f"camRect{k}")), turned)
-            camera = replace(camera, rectified=ideal)
-        found.append(camera)
+        turn = placed.rigid(f"R_rect{k}", placed.matrix(f"R_rect{k}", 3, 3), np.zeros(3))
+        raw, ideal = (_pinhole_lens(stated.sub(f"{name}{k}"), "distortion_coeffs") for name in ("cam", "camRect"))
+        rectified = CalibratedCamera(f"cam{k}", ideal, turn @ T)
+        found.append(CalibratedCamera(f"cam{k}", raw, T, rectified))
     return found
-
-
-DSO = re.compile(
-    r"^(Pinhole|RadTan|EquiDistant|KannalaBrandt)((?:[ \t]+[-+.\deE]{1,40}){5,8})\s*^(\d+)[ \t]+(\d+)", re.M
-)
-"""Beginning of a calibration of DSO and 4Seasons: model with fx, fy, cx, cy and coefficients; width and height."""
-
-
-def dso(text: str, path: Path) -> list[CalibratedCamera]:
-    """The camera of ``calib_0.txt`` or ``calib_1.txt``; ``calib_stereo.txt`` beside them has T_right_left, metres."""
-    model, numbers, *size = DSO.findall(text)[0]
-    stated = {"intrinsics": numbers.split()[:4], "distortion_coeffs": numbers.split()[4:], "resolution": size}
-    f = Fields(stated, str(path))
-    bent = any(f.numbers("distortion_coeffs"))
-    f.values |= {"distortion_model": model} if bent else {"distortion_coeffs": []}
-    stereo, T = path.with_name(re.sub(r"_[01]\.", "_stereo.", path.name)), None
-    if stereo != path and stereo.is_file():
-        rig = Fields({"T_right_left": read_text(stereo, "calibration").split()}, str(stereo))
-        T = rig.pose("T_right_left") if "_1." in path.name else RigidTransform.identity()
-    return [CalibratedCamera(path.stem, _pinhole_lens(f), T)]
 
 
 def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
@@ -157,11 +137,10 @@ def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
     kind = f.text("lensmodel")
     if not re.fullmatch(r"LENSMODEL_(PINHOLE|OPENCV\d+)", kind):
         raise f.error("RIL-769", "lensmodel", f"= {kind} is not read", "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE")
-    numbers, rt = f.numbers("intrinsics"), np.array(f.numbers("extrinsics", 6))
-    size = f.values.get("imagersize")
-    lens = _pinhole_lens(
-        Fields({"intrinsics": numbers[:4], "distortion_coeffs": numbers[4:], "resolution": size}, str(path))
-    )
+    fx, fy, cx, cy, *coefficients = f.numbers("intrinsics")
+    camera = f.camera("intrinsics", (fx, fy, cx, cy), f.size("imagersize"))
+    rt = np.array(f.numbers("extrinsics", 6))
+    lens = f.lens("intrinsics", camera, *by_count(tuple(coefficients)))
     return [CalibratedCamera(path.stem, lens, f.rigid("extrinsics", rotation_exp(rt[:3]), rt[3:]))]
 
 
@@ -169,20 +148,17 @@ def sensor(f: Fields, path: Path) -> list[CalibratedCamera]:
     """The camera of a ``sensor.yaml``: ``T_BS`` maps the sensor to the body, metres; it is named by its folder."""
     T = f.pose("T_BS").inverse() if "T_BS" in f else None
     name = path.parent.name if path.stem == "sensor" and path.parent.name else path.stem
-    return [CalibratedCamera(name, _pinhole_lens(f), T)]
+    return [CalibratedCamera(name, _pinhole_lens(f, "distortion_coefficients"), T)]
 
 
-def _pinhole_lens(f: Fields) -> Lens:
+def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     kind = f.text("camera_model", "pinhole")
     if kind.lower() != "pinhole":
         remedy = "calibrate as pinhole with radtan or equidistant"
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
-    key = f.spelt(("intrinsics", "camera_matrix"))
+    key = f.spelt(("intrinsics", "camera_matrix"))  # the latter of DSEC
     fx, fy, cx, cy = f.numbers(key, 4)
-    if "sensor_type" in f and "resolution" not in f:
-        fy, cx = cx, fy  # OpenLORIS lists fx, cx, fy, cy
-    size = f.size("resolution") if "resolution" in f else f.size("width", "height")
-    return f.distorted(f.spelt(("distortion_coeffs", "distortion_coefficients")), f.camera(key, (fx, fy, cx, cy), size))
+    return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), f.size("resolution")))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

@@ -69,12 +69,6 @@ def entries(pairs: Iterable[tuple[str, Any]], file: str) -> dict[str, Any]:
     return found
 
 
-def words(value: str) -> str | list[str]:
-    """The word of a text, or its words as a list, perhaps in brackets as of MATLAB."""
-    found = value.strip("[]").replace(";", " ").split()
-    return found[0] if len(found) == 1 else found
-
-
 def assignments(text: str) -> list[tuple[str, str]]:
     """Lines ``key = value``, stripped; a line of another form has the key "" and is its own value."""
     found = []

@@ -16,7 +16,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
-from rille.datasets.cameras.text import assignments, entries, words
+from rille.datasets.cameras.text import assignments
 from rille.stages.geometry.geometry import Camera
 from rille.stages.geometry.lens import COEFFICIENTS, Lens
 
@@ -28,7 +28,8 @@ HEADER = re.compile(r"(VERSION_\d+|PINHOLE)?")
 
 def tsai(text: str, path: Path) -> list[CalibratedCamera]:
     """The camera, named by its file; its pose refers to the file's world. The image size is unknown."""
-    f, lens = _entries(text, str(path))
+    lines = assignments(text)
+    f = Fields.of_lines(lines, str(path))
     pitch = f.number("pitch", 1.0)
     if not pitch > 0:
         raise f.error("RIL-146", "pitch", f"= {pitch:g} is not positive")
@@ -42,17 +43,11 @@ def tsai(text: str, path: Path) -> list[CalibratedCamera]:
         raise f.error("RIL-147", "u_direction", mirrored, "give a model without mirroring")
     T_world_body = f.transform("R", "C")
     T_camera_body = f.rigid("u_direction", axes, np.zeros(3))
-    found = CalibratedCamera(path.stem, _lens(f, lens, camera), T_camera_body @ T_world_body.inverse())
+    # The name of the lens model stands alone on its line.
+    model = next((value for key, value in lines if not key and not HEADER.fullmatch(value)), "")
+    found = CalibratedCamera(path.stem, _lens(f, model, camera), T_camera_body @ T_world_body.inverse())
     f.check_lens()
     return [found]
-
-
-def _entries(text: str, file: str) -> tuple[Fields, str]:
-    """Entries ``key = numbers``, and the name of the lens model, alone on its line."""
-    lines = assignments(text)
-    values = entries(((key, words(value)) for key, value in lines if key), file)
-    lens = next((value for key, value in lines if not key and not HEADER.fullmatch(value)), "")
-    return Fields(values, file), lens
 
 
 def _lens(f: Fields, kind: str, camera: Camera) -> Lens:

@@ -5,13 +5,11 @@ Files are PFM, TIFF and npy of floating point, pixels, or PNG of 16 bits as KITT
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 from warnings import catch_warnings
 
 import numpy as np
@@ -20,7 +18,7 @@ from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.headers import opened
 from rille.datasets.images.pairing import ends, natural, without_side
-from rille.datasets.text.reading import Search, open_regular
+from rille.datasets.text.reading import Search
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, within
@@ -44,27 +42,15 @@ def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
     InputError
         The file is damaged, of another kind or size, or its values are of another type.
     """
-    with _refused(name):
-        values = _checked(BytesIO(data), size)().astype(np.float32)
-    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
-
-
-@contextmanager
-def _refused(name: str) -> Iterator[None]:
-    """Turn what parsers of a file, called ``name``, raise into one error."""
     try:
         with catch_warnings(action="ignore"):
-            yield
+            # First bytes of NumPy's files.
+            values = _numpy(data, size) if data.startswith(b"\x93NUMPY") else _image(data, size)
+            values = values.astype(np.float32)
     except Exception as error:  # parsers of a damaged file raise anything
         text = f"{name} cannot be read as a map of disparities: {' '.join(str(error).split())[:100]}"
         raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
-
-
-def _checked(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """Function that unpacks a map, whose header is that of one of this size; else a ``ValueError``."""
-    # First bytes of NumPy's files.
-    start, _ = file.read(6), file.seek(0)
-    return _numpy(file, size) if start == b"\x93NUMPY" else _image(file, size)
+    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
 
 
 def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> None:
@@ -76,91 +62,61 @@ def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> No
         raise ValueError("its values are of a type whose unit is not known")
 
 
-def _numpy(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
+def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
     """An array of NumPy, without execution of any content, and without more memory than the file has."""
+    file = BytesIO(data)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
     shape = tuple(side for side in shape if side != 1)  # networks have one channel, and one image a batch
     _check(shape[::-1], size, dtype.kind == "f")
-    order: Literal["F", "C"] = "F" if by_columns else "C"
-    start = file.tell()
-    if file.seek(0, os.SEEK_END) - start < size[0] * size[1] * dtype.itemsize:
-        raise ValueError("it is truncated")
-    file.seek(start)
-    return lambda: np.frombuffer(file.read(), dtype, size[0] * size[1]).reshape(shape, order=order)
+    return np.frombuffer(data, dtype, size[0] * size[1], file.tell()).reshape(shape, order="F" if by_columns else "C")
 
 
-def _image(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
+def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
     """An image of disparities."""
-    image = opened(file)
+    image = opened(BytesIO(data))
     if image is None:
         raise ValueError("it is of no kind that is read")
     coded = image.format == "PNG" and image.mode == "I;16"
     _check(image.size, size, coded or image.mode == "F")
-
-    def values() -> AnyArray:
-        # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
-        array = np.asarray(image, np.float32) / (256 if coded else 1)
-        # GDAL's tag of TIFF: value of the pixels without data.
-        if image.format == "TIFF" and 42113 in image.tag_v2:
-            array[array == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
-        return array
-
+    # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
+    values = np.asarray(image, np.float32) / (256 if coded else 1)
+    # GDAL's tag of TIFF: value of the pixels without data.
+    if image.format == "TIFF" and 42113 in image.tag_v2:
+        values[values == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
     return values
 
 
-def find(pattern: str, root: Path, lefts: Sequence[Path], size: tuple[int, int], key: str) -> list[Path | InputError]:
-    """The map of each left image, by name (without sides' tokens) or number; by order if names have nothing in common.
+def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:
+    """The map of each left image that has one, by name (without sides' tokens) or number, whichever finds more.
+
+    By order, if names have nothing in common.
 
     Parameters
     ----------
     pattern : of the maps below ``root``.
-    size : of the left images, which the headers of the maps state.
     key : name of the manifest's entry, for errors.
-
-    Returns
-    -------
-    For each image its map, or the error of one that is missing or cannot be read.
 
     Raises
     ------
     InputError
-        Maps and images do not fit, no map can be read, or the pattern is none.
+        No image has a map, or the pattern is none.
     """
     with within(key):
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
-    taken, lacking = list[Path | None](), ""
+    found: dict[Path, Path] = {}
     for name in (lambda path: without_side(path.stem, 0), last_number):
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
-        if len(ours) < len(maps) or len(theirs) < len(lefts) or (taken and not ours.keys() >= theirs.keys()):
-            continue  # keys are not unique, or the ones before tell as much
-        shared = ours.keys() & theirs.keys()
-        lacking = lacking or next((path.name for one, path in theirs.items() if shared and one not in ours), "")
-        # Of few images, and of others, the numbers may be another program's count.
-        if shared and (len(shared) == len(ours) or 2 * len(shared) > len(theirs)):
-            taken = [ours.get(one) for one in theirs]
-    if not taken and len(maps) == len(lefts) and (len(maps) == 1 or not lacking):
-        taken = [*maps]
+        if len(ours) == len(maps) and len(theirs) == len(lefts):  # else keys are not unique
+            found = max(found, {path: ours[one] for one, path in theirs.items() if one in ours}, key=len)
+    if len(maps) == len(lefts) and (len(maps) == 1 or not found):
+        found = dict(zip(lefts, maps, strict=True))
+    if found:
+        return found
     those = ends(maps) if maps else f"none in {root}"
     text = f"{key} = {pattern!r}: {count(len(maps), 'map')} ({those}) for {count(len(lefts), 'left image')}"
     remedy = f"give one map a pair, named or numbered as the left images are ({ends(lefts)})"
-    if not taken:
-        raise InputError("RIL-901", text + (f", none for {lacking}" if lacking else ""), remedy=remedy)
-    missing = (InputError("RIL-911", f"{text}, none for {left.name}", remedy=remedy) for left in lefts)
-    found = [error if path is None else _sound(path, size) for path, error in zip(taken, missing, strict=True)]
-    if not any(isinstance(one, Path) for one in found):
-        raise next(one for one, path in zip(found, taken, strict=True) if path and isinstance(one, InputError))
-    return found
-
-
-def _sound(path: Path, size: tuple[int, int]) -> Path | InputError:
-    """The path, or the error by which the file is no map of this size, as far as its header tells."""
-    try:
-        with open_regular(path, "map", files.MOST_BYTES) as file, _refused(str(path)):
-            _checked(file, size)
-    except InputError as error:
-        return error
-    return path
+    raise InputError("RIL-901", text, remedy=remedy)
 
 
 def last_number(path: Path) -> int:

@@ -270,8 +270,16 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
     are two frames of A and of B.
     ``timed``: time stamps in the names aside, which may differ between the cameras.
     """
-    found, numbered = list[dict[str, list[int]]](), list[dict[str, list[int]]]()
     words = [re.split(r"([^\W_]+)", STAMP.sub("", undated(name)) if timed else name) for name in names]
+    longest = max(map(len, words), default=0)
+    # Of names with unlike numbers of words the last ones are compared, if the first tell nothing: a_b/cam_3, c/cam_3.
+    behind = [[""] * (longest - len(split)) + split for split in words]
+    return _by_one_word(words, timed) or (_by_one_word(behind, timed) if behind != words else {})
+
+
+def _by_one_word(words: Sequence[list[str]], timed: bool) -> dict[str, list[int]]:
+    """Indices of names, parted into ``words`` and what is between them."""
+    found, numbered = list[dict[str, list[int]]](), list[dict[str, list[int]]]()
     places = range(1, min(map(len, words), default=0), 2)
     halves = {k: [w[k] == words[0][k] for w in words] for k in places if len({w[k] for w in words}) == 2}
     for k, half in halves.items():
@@ -350,7 +358,7 @@ def pair_up(
         lines.append(warning("RIL-835", f"{text}; if they are two, give each a manifest (images.left, images.right)"))
     joined = join(*times, tolerance) if all(times := (_fine_times(left), _fine_times(right))) else None
     both = " and ".join(f"{len(of)} {side} images ({ends(of)})" for side, of in (("left", left), ("right", right)))
-    rule = rule if rule != "auto" else _fitting(left, right, names, joined)
+    stated, rule = rule, rule if rule != "auto" else _fitting(left, right, names, joined)
     if rule == "order":
         if len(left) != len(right):
             remedy = "remove what is too many, or pair by name or number"
@@ -373,6 +381,8 @@ def pair_up(
     if growing:
         by_key = _up_to_last_pair(*by_key)
     shared, present = set(by_key[0]) & set(by_key[1]), set(by_key[0]) | set(by_key[1])
+    if stated == "auto" and rule == "folder" and not shared and len(left) == len(right):
+        return _named(list(zip(left, right, strict=True)))  # a/camera_00/0.png and a/camera_02/0.png
     if rule != "number" and 2 * len(shared) > len(present):
         return _with_gaps(by_key, rule, root)
     alone = [path for ours in by_key for key, path in ours.items() if key not in shared]

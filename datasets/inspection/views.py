@@ -6,16 +6,17 @@ import glob
 import os
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 from rille.datasets.images import pairing
 from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.kinds import line, split
-from rille.datasets.images.pairing import ImagePair, of_one_camera, side_of
+from rille.datasets.images.kinds import split
+from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
 from rille.datasets.text.names import shell_word
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
@@ -69,14 +70,14 @@ Sets = dict[tuple[int, str], tuple[list[Path], list[Path]]]
 
 
 def _by_token(images: list[Path], names: list[str]) -> Sets:
-    """Images whose names have a side's token, in sets of one place and kind; a set may have one side alone."""
+    """Images whose names have a side's token, in sets of one place; a set may have one side alone."""
     named: Named = defaultdict(list)
     groups: Sets = defaultdict(lambda: ([], []))
     for path, name in zip(images, names, strict=True):
         if (at := side_of(name)) is not None:
             row, side, neutral = at
-            named[row, f"{neutral.rpartition('/')[0]} {path.suffix.lower()}"].append((neutral, side, path))
-    for (row, place), found in named.items():
+            named[row, neutral.rpartition("/")[0]].append((neutral, side, path))
+    for (row, place), found in _of_one_kind(named):
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
@@ -138,7 +139,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         both, parts, counts = _sets(folder, images)
     if parts:
         first, second = parts
-        both, tokens = _by_place(folder, parts), ((first, second),)
+        both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
@@ -154,7 +155,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     except InputError as error:
         trouble = str(error)
     sides = tokens[key[0]]
-    others = _of_other_sets(folder, key, both)
+    others = [_of_another_set(of, left[0], folder) for at, of in both.items() if at != key]
     paired = {path for of in both.values() for path in (*of[0], *of[1])}
     alone = [relative(path, folder) for path in photographs if path not in paired]
     if computed := [relative(path, folder) for path in images if path not in set(photographs)]:
@@ -162,6 +163,12 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     if len(matched) == 1 and sides[0][-1].isdigit() and (alone or any(at != key and at[1] == key[1] for at in both)):
         taken = f"{sides[0]!r} and {sides[1]!r} are taken for two cameras"
         lines.append(f"{taken}; if they are frames of one, name its folder left or right")
+    places = dict.fromkeys(os.path.commonpath([pair.left.parent, pair.right.parent]) for pair in matched)
+    if len(places) == len(matched) > 1 and not all(re.search(r"\d$", place) for place in places):
+        one = f"`rille init {shell_word(next(iter(places)))}`"
+        lines.append(
+            f"each pair has a folder of its own: if they are scenes, not frames of one camera, {one} takes one"
+        )
     return FoundImages(
         pattern(left, folder),
         pattern(right, folder),
@@ -177,37 +184,20 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     )
 
 
-def _by_place(folder: Path, parts: dict[str, list[Path]]) -> Sets:
-    """Images by camera, a set for each folder without the words of cameras, unless each has one frame, or one side."""
-    places: Sets = defaultdict(lambda: ([], []))
-    for side, images in enumerate(parts.values()):
-        for path in images:
-            words = re.split(r"([^\W_]+)", relative(path.parent, folder))
-            places[0, "".join("*" if word in parts else word for word in words)][side].append(path)
-    left, right = parts.values()
-    apart = all(map(all, places.values())) and any(min(map(len, of)) > 1 for of in places.values())
-    return places if apart else {(0, ""): (left, right)}
-
-
-def _of_other_sets(folder: Path, chosen: tuple[int, str], both: Sets) -> list[str]:
-    """A line on the sets that are not chosen, with the command for one of them where it has a folder of its own."""
-    tops = {at: Path(os.path.commonpath([path.parent for path in (*of[0], *of[1])])) for at, of in both.items()}
-    taken, apart = tops.pop(chosen), list[str]()
-    for at, top in tops.items():
-        own = not any(top == other or top in other.parents for other in (folder, taken))
-        apart.append(relative(top, folder) if own else f"{pattern(both[at][0], folder)} and its right images")
-    remedy = "a manifest opens one of them: state its images.left and images.right"
-    if apart and (folder / apart[0]).is_dir():
-        remedy = f"each is a sequence of its own: `rille init {shell_word(folder / apart[0])}`"
-    return [line("other set", apart, remedy)] if apart else []
+def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: Path) -> str:
+    """A line on pairs beside those of the left image ``taken``, and how they are opened."""
+    place = Path(os.path.commonpath([path.parent for of in sides for path in of]))
+    # A folder of a camera is none of pairs.
+    own = taken.is_relative_to(place) or not place.is_relative_to(folder)
+    how = "images.left and images.right of a manifest" if own else f"`rille init {shell_word(place)}`"
+    return f"{pattern(sides[0], folder)} and its right images: of another set, which {how} would take"
 
 
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
     text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
-    turns = 'images.left = "*[02468].png", images.right = "*[13579].png", images.pair = "order"'
-    by_name = f"give the folder of both cameras, {called}, or write a manifest by hand (of images by turns {turns})"
+    by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
     remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"
     text += "" if images else f" ({DEPTH} folders deep)"
     if images and sum(counts) in (0, len(images)) and not all(counts):
@@ -215,7 +205,28 @@ def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError
             header = common_header(images[:1]).header
             if not header.height <= header.width < 2 * header.height:
                 remedy = f"{split('each shows', 'FILE')}; else {by_name}"
+        alternate = 'images.left = "*[02468].png", images.right = "*[13579].png", images.pair = "order"'
+        remedy += (
+            f" (of images that show left and right in turn by {alternate})"
+            if not (sum(counts) or of_one_camera(folder))
+            else ""
+        )
     return InputError("RIL-194", text, remedy=of_one_camera(folder) + remedy)
+
+
+def _of_one_kind(named: Named) -> Iterator[tuple[tuple[int, str], list[tuple[str, int, Path]]]]:
+    """Images of one place and kind, or of several kinds in turns (1.png, 2.jpg, 3.png), with the place's name."""
+    for (row, place), found in named.items():
+        kinds = defaultdict(list)
+        for neutral, side, path in found:
+            kinds[path.suffix.lower()].append((neutral, side, path))
+        row_of_kinds = [path.suffix.lower() for _, _, path in sorted(found, key=lambda of: (of[1], natural(of[0])))]
+        changes = sum(a != b for a, b in pairwise(row_of_kinds))
+        shapes = {re.sub(r"\d+", "", neutral) for neutral, _, _ in found}
+        # Of two kinds with the same names one is made of the other; of a few of another kind nothing is known.
+        in_turns = len({of[:2] for of in found}) == len(found) and len(shapes) == 1 and changes > 2 * len(kinds)
+        for kind, of_kind in [("", found)] if in_turns else kinds.items():
+            yield (row, f"{place} {kind}"), of_kind
 
 
 def pattern(paths: list[Path], folder: Path) -> str:

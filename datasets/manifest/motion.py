@@ -127,6 +127,11 @@ class MotionReader:
         known = [k for k, stamp in enumerate(stamps) if stamp is not None]
         rows = [stamp for stamp in stamps if stamp is not None]
         times = seconds([t for t, _ in rows], what, unit=unit, lines=[line for _, line in rows])
+        usual = float(np.median(np.diff(times))) if times[1:] else 0.0
+        # 10 s: no vehicle takes frames so far apart, and whole numbers in milliseconds would be.
+        if unit == "auto" and times[0] < 1e8 and usual >= 10.0 and all(map(float.is_integer, times)):
+            text = f"times of {what} are {usual:g} s apart, if they are seconds: are they milliseconds or less?"
+            self.warn((warning("RIL-718", f"{text} State times.unit"),))
         return tuple(float(t) for t in np.interp(range(len(stamps)), known, times))
 
     def stamps_of_names(self, unit: str) -> tuple[str, list[tuple[str, int]]]:
@@ -320,7 +325,7 @@ class MotionReader:
         if spacing > section.max_gap:
             text = f"{table}.max_gap: {section.file} has rows {spacing:.4g} s apart, more than "
             text += f"{section.max_gap:g} s: nothing would be compared"
-            remedy = f"raise {table}.max_gap, if straight lines between them are exact enough"
+            remedy = f"raise {table}.max_gap, if straight lines between them are exact enough; name a unit: time_ms"
             raise InputError("RIL-804", text, remedy=remedy)
 
     def positions(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,14 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up, writable
-from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, read_manifest
+from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, RigSection, read_manifest
 from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import Search, nearest_hint
+from rille.datasets.text.reading import Search, nearest_hint, read_bytes
 from rille.stages.core.declare import NoParams
-from rille.stages.core.errors import IncompleteError, InputError, warning, within
-from rille.stages.core.quantities import count
+from rille.stages.core.errors import IncompleteError, InputError, within
 
 VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -46,33 +45,45 @@ def open_manifest(path: Path, digests: files.Digests) -> Sequence:
     return open_described(named, root_folder(manifest.root, path), str(path), digests)
 
 
-def open_described(
-    manifest: Manifest, root: Path, name: str, digests: files.Digests, spare: Iterable[Path] = ()
-) -> Sequence:
+def open_folder(manifest: Manifest, folder: Path, digests: files.Digests, spare: Iterable[Path]) -> Sequence:
+    """The sequence of a folder by the manifest of its layout, whose reader finds the files of ``spare`` by itself."""
+    try:
+        return open_described(manifest, folder, str(folder), digests)
+    except InputError as error:
+        wrong = next((path for path in spare if str(path) in error.message), None)
+        if wrong is None:
+            raise
+        remedy = f"{error.remedy}; or rename {wrong}: the folder opens without it"
+        raise type(error)(error.code, error.message, remedy=remedy) from error
+
+
+def open_described(manifest: Manifest, root: Path, name: str, digests: files.Digests) -> Sequence:
     """The sequence of a manifest, which comes from a file or from the reader of a folder layout.
 
     Parameters
     ----------
     root : folder that the files are relative to.
     name : the manifest's or the folder's, for errors.
-    spare : files and folders without which the folder opens, too.
     """
-    try:
-        with within(name):
-            return _described(manifest, root, digests)
-    except InputError as error:
-        named = (path for path in spare if re.search(rf"(?<![\w.-]){re.escape(path.name)}(?![\w-])", error.message))
-        needless = next(filter(Path.exists, named), None)
-        if needless is None:
-            raise
-        remedy = f"{error.remedy}; or rename {needless}: the folder opens without it"
-        raise type(error)(error.code, error.message, remedy=remedy) from error
+    with within(name):
+        return _described(manifest, root, digests)
 
 
 def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequence:
     base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
-    for key, stated in (("disparity", manifest.disparity), ("truth_disparity", manifest.truth_disparity)):
-        base = _with_maps(key, stated, root, base, pairs, digests)
+    if manifest.disparity is not None:
+        note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
+        disparity, absent = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
+        base = replace(base, disparity=disparity, lost={**absent, **base.lost}, notes=(*base.notes, note))
+    if manifest.truth_disparity is not None:
+        exact, absent = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
+        note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
+        note += f" {len(pairs) - len(absent)} of {len(pairs)} pairs" if absent else ""
+
+        def judged(frame: int) -> Source | None:
+            return None if frame in absent else exact(frame)
+
+        base = replace(base, truth_disparity=judged, notes=(*base.notes, note))
     sequence = MotionReader(root, pairs, base, digests.growing, manifest.world.crs or "").read(manifest)
     world, pinned = manifest.world, {} if manifest.rig.file is None else {"rig.mode": "fixed"}
     return replace(
@@ -124,61 +135,48 @@ def _of_bag(manifest: Manifest, root: Path) -> tuple[Sequence, tuple[ImagePair, 
     (path, _, left), (other, _, right) = (text.partition(":") for text in (manifest.images.left, manifest.images.right))
     if path != other or not is_bag(root / path):
         return None
-    stated = manifest.cameras != Cameras() or manifest.rig.file is not None
+    stated = manifest.cameras != Cameras() or manifest.rig != RigSection()
     topics = f"{left},{right}" if left and right else None
     rectified = _are_rectified(manifest.images, (left, right))
     optics_of = (lambda sizes: read_optics(manifest, root, sizes, rectified)) if stated else None
-    sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance, manifest.rig)
+    sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance)
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
 
-def _with_maps(
+def _disparity(
     key: str,
-    stated: DisparityMaps | None,
+    stated: DisparityMaps,
     root: Path,
     sequence: Sequence,
     pairs: tuple[ImagePair, ...],
     digests: files.Digests,
-) -> Sequence:
-    """The sequence with another program's, or with true disparities; ``key``: name of the table, and of the attribute.
-
-    A pair without a map of another program is lost; one without a true map is not judged.
-    """
-    if stated is None:
-        return sequence
+) -> tuple[Callable[[int], Source], dict[int, str]]:
+    """Function that returns the source of another program's, or of the true disparity of a frame; and why frames have
+    none. ``key``: name of the table."""
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
         raise InputError("RIL-902", text, remedy=remedy)
-    frames = [k for k, pair in enumerate(pairs) if not pair.absent]
-    size = sequence.rig.left.width, sequence.rig.left.height
+    lefts = [pair.left for pair in pairs if not pair.absent]
+    maps = {"column_disparity": disparities.find(stated.left, root, lefts, f"{key}.left")}
     claimed = stated.sigma if isinstance(stated, Disparity) else None
-    patterns = [("column_disparity", "left", stated.left)]
-    patterns += [("disparity_std", "sigma", claimed)] if isinstance(claimed, str) else []
-    maps, absent = dict[str, dict[int, Path]](), dict[int, str]()
-    for array, name, pattern in patterns:
-        found = disparities.find(pattern, root, [pairs[k].left for k in frames], size, f"{key}.{name}")
-        maps[array] = {k: one for k, one in zip(frames, found, strict=True) if isinstance(one, Path)}
-        absent |= {k: one.message for k, one in zip(frames, found, strict=True) if isinstance(one, InputError)}
-    common = {"size": list(size), "sign": stated.sign, "sigma": None if isinstance(claimed, str) else claimed}
+    sigma = claimed if isinstance(claimed, float) else None
+    if isinstance(claimed, str):
+        maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
+    size = sequence.rig.left.width, sequence.rig.left.height
+    common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
+    for of in maps.values():
+        first = next(iter(of.values()))
+        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # raises errors early
 
     def source(frame: int) -> Source:
-        paths = {array: by_frame[frame] for array, by_frame in maps.items()}
+        paths = {array: of[pairs[frame].left] for array, of in maps.items()}
         args = {**common, "frame": frame, "digests": {array: digests.sha256(path) for array, path in paths.items()}}
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
-    if key == "disparity":
-        note = f"disparities are those of {stated.left}, made by another program, and checked"
-        return replace(sequence, disparity=source, lost={**sequence.lost, **absent}, notes=(*sequence.notes, note))
-    note = f"true disparities are those of {stated.left}; they only judge"
-    there = f"{count(len(absent), 'pair')} without a true disparity ({next(iter(absent.values()), '')})"
-    return replace(
-        sequence,
-        truth_disparity=lambda frame: None if frame in absent else source(frame),
-        notes=(*sequence.notes, note),
-        warnings=(*sequence.warnings, *([warning("RIL-686", there)] if absent else [])),
-    )
+    lacking = (k for k, pair in enumerate(pairs) if any(pair.left not in of for of in maps.values()))
+    return source, {k: f"the map of {pairs[k].left.name} ({key}) is missing" for k in lacking}
 
 
 def default_name(path: Path) -> str:

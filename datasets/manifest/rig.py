@@ -68,7 +68,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     above = manifest.world.up
     up = None if above is None else direction(above, left.T_camera_reference)
     pinned = None if manifest.rig.file is None else _pinned(root / manifest.rig.file)
-    left, right, lines = placed(left, right, manifest.rig, pinned)
+    left, right, lines = _placed(left, right, manifest.rig, pinned)
     rig, lenses = rig_of(left, right, sizes)
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
@@ -161,8 +161,8 @@ def direction(stated: Vector, T_camera_reference: RigidTransform | None) -> Vect
     return stated if T_camera_reference is None else vector_of(T_camera_reference.rotation @ stated)
 
 
-def placed(
-    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None = None
+def _placed(
+    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame, by the manifest, else by the files; and warnings."""
     of_files = relative_pose(left, right)
@@ -179,7 +179,8 @@ def placed(
         if theirs > 0 and abs(ours - theirs) > 0.01 * theirs:
             text = f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m"
             lines.append(warning("RIL-693", text))
-    return replace(left, T_camera_reference=RigidTransform.identity()), replace(right, T_camera_reference=chosen), lines
+    placed = replace(left, T_camera_reference=RigidTransform.identity())
+    return placed, replace(right, T_camera_reference=chosen), lines
 
 
 def _pinned(path: Path) -> Rig:
@@ -206,9 +207,16 @@ def _stated(section: RigSection, of_files: RigidTransform | None) -> RigidTransf
 
 def check_baseline(baseline: float, section: RigSection) -> list[str]:
     """Refuse a length (m) that looks like one in another unit, or warn about it, unless the unit is stated."""
+    from_files = section.baseline is None and section.T_right_left is None
+    # 1e-3 m: cameras stand no closer, but a unit that the file states counts twice.
+    if baseline < 1e-3 and from_files and section.unit < 1.0:
+        text = (
+            f"the baseline is {baseline:g} m by rig.unit = {section.unit:g}, and {baseline / section.unit:g} m without"
+        )
+        remedy = "leave rig.unit out: the calibration states its unit, or its format defines it"
+        raise InputError("RIL-856", text, remedy=remedy)
     if baseline <= USUAL_BASELINE or "unit" in section.model_fields_set:
         return []
-    from_files = section.baseline is None and section.T_right_left is None
     if baseline > LONGEST_BASELINE:
         hint = "a manifest's rig.unit = 0.001 or 0.01 reads a calibration in these" if from_files else "give metres"
         text = f"the baseline is {baseline:g} m, which looks like millimetres or centimetres"

@@ -27,6 +27,8 @@ SPELT = (
     ("deg", "deg(rees?|s)|\N{DEGREE SIGN}"),
     ("gon", "grads?|grades?"),
     ("rad", "rad(ians?|s)"),
+    ("mm", "millimet(er|re)s?"),
+    ("cm", "centimet(er|re)s?"),
     ("m", "met(er|re)s?"),
     ("usft", "us[- ]?(survey[- ]?)?(f(ee|oo)?t)|ft[-_ ]?us"),
     ("ft", "feet|foot"),

@@ -13,7 +13,7 @@ from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.runs import lookup, roots
+from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, FAILED, FLAG, RUNS, CacheFolder, Runs, cache_folder
 from rille.stages.core.errors import ConfigError
 
@@ -55,7 +55,7 @@ def gc(
         List by stage what would be removed, and remove nothing.
     """
     store = Store(_there(cache))
-    ledgers = [path for folder in roots.folders(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
+    ledgers = [path for folder in maintenance.noted_runs(store, runs) for path in folder.glob(f"*/*/{lookup.LEDGER}")]
     kept = set[str]().union(*(lookup.used(path.parent) for path in ledgers if path.is_file()))
     if not kept:
         text = f"no run is known that uses the cache {store.root}: all of it would go"

@@ -1,12 +1,16 @@
-"""Errors on the command line: one line with a code, and an exit code."""
+"""Errors on the command line: one line with a code, and an exit code; also of several sequences in one command."""
 
 from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
+from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.plain import one_line
-from rille.pipeline.runs.options import FAILED, USAGE
+from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE
+from rille.stages.core.errors import ConfigError, InputError
 
 LONGEST_COMPLAINT = 1000
 """Characters."""
@@ -14,9 +18,6 @@ LONGEST_COMPLAINT = 1000
 
 def complain(error: Exception, *, debug: bool = False) -> int:
     """Print an error in one line, with the traceback if ``debug``; return its exit code."""
-    from rille.pipeline.engine.failures import translated
-    from rille.stages.core.errors import ConfigError, InputError
-
     if debug:
         traceback.print_exception(error)
     if (known := translated(error)) is not None:
@@ -33,3 +34,28 @@ def print_error(code: str, words: str) -> None:
     if len(line) > LONGEST_COMPLAINT:  # it may quote a file, of which this is enough to find the place
         line = f"{line[: LONGEST_COMPLAINT // 2]} ... {line[-LONGEST_COMPLAINT // 2 :]}"
     print(f"rille: error {code}: {line}", file=sys.stderr)
+
+
+Ended = list[tuple[str, Path | str]]
+"""Sequences, each with the folder of its run, or the code or the type of its error."""
+
+
+def each(
+    sequences: Sequence[str], one: Callable[[str], tuple[int, Path | str]], *, keep_going: bool
+) -> tuple[int, Ended]:
+    """Call ``one`` for each sequence, up to the first error unless ``keep_going``; the most severe of the exit codes,
+    and what ``one`` gave for each."""
+    worst, ended = COMPLETE, Ended()
+    for number, sequence in enumerate(sequences, 1):
+        print(f"rille: {sequence} ({number} of {len(sequences)})", file=sys.stderr)
+        try:
+            code, end = one(sequence)
+        except Exception as error:  # faults of the program too: they may not affect the others
+            known = translated(error)
+            code, end = complain(error), type(error).__name__ if known is None else known.code
+        ended.append((sequence, end))
+        # The least severe first.
+        worst = max(worst, code, key=(COMPLETE, HOLES, USAGE, FAILED).index)
+        if code in (USAGE, FAILED) and not keep_going:
+            break
+    return worst, ended + [(sequence, "not begun") for sequence in sequences[len(ended) :]]

@@ -16,8 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rille.pipeline.engine.code_digest import OWN, tree_digest
-from rille.pipeline.engine.packages import NAMED, version
+from rille.pipeline.engine.keys import NAMED, OWN, tree_digest, version
 from rille.pipeline.engine.plain import one_line
 from rille.pipeline.engine.runtime import atomic
 from rille.stages.core.errors import ConfigError

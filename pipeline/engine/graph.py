@@ -20,25 +20,9 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, NamedTuple, cast
 
-from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
+from rille.pipeline.engine.task import Refs, Spec, flatten_ports, map_ports
 from rille.stages.core.declare import F, Params, Stage
-
-
-@dataclass(frozen=True, slots=True)
-class Took:
-    """What a task took: ``seconds`` and peak memory [bytes] of the call, ``kernel`` seconds of the stage itself.
-
-    ``started`` is when the call began (seconds since 1970); ``compiling`` are the seconds for which it compiled;
-    ``worker`` is the name of the dask worker that ran it.
-    """
-
-    seconds: float = 0.0
-    peak_rss: int = 0
-    started: float = 0.0
-    kernel: float = 0.0
-    compiling: float = 0.0
-    worker: str = ""
 
 
 @dataclass(eq=False, slots=True)
@@ -103,11 +87,11 @@ class Maybe:
 
 
 class Waiting(NamedTuple):
-    """A flow that waits for handles: ``go_on`` takes their references, with ``holes`` None of those that failed."""
+    """A flow that waits for handles: ``go_on`` takes their references, None of those that failed; None: it never goes
+    on."""
 
     handles: list[Handle]
-    go_on: Callable[..., None]
-    holes: bool
+    go_on: Callable[..., None] | None
 
 
 class Complete(frozenset[str]):
@@ -234,7 +218,7 @@ class Graph:
             wanted = None
         except MissingError as error:
             # The flow never goes on; the end of the run names the tasks that it waited for.
-            self.waiting.append(Waiting(error.handles, lambda *_: None, holes=False))
+            self.waiting.append(Waiting(error.handles, None))
             return
         if wanted is None:
             return
@@ -249,7 +233,7 @@ class Graph:
             else:
                 self._go_on(steps, lambda: steps.send(refs[0] if one else list(refs)))
 
-        self.waiting.append(Waiting(handles, resume, holes=True))
+        self.waiting.append(Waiting(handles, resume))
 
 
 def _check_ports(spec: Spec, given: Mapping[str, Handle | list[Handle]]) -> None:

@@ -17,7 +17,7 @@ import psutil
 
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import cores
-from rille.pipeline.engine.spec import map_ports
+from rille.pipeline.engine.task import map_ports
 from rille.stages.core.errors import ConfigError
 
 WORKER_BYTES = 250e6

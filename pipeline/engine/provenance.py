@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from rille.pipeline.engine.plain import brief
-from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.pipeline.engine.runtime.atomic import read_hint, write_hint
 from rille.stages.core.errors import told
 
 if TYPE_CHECKING:
     from rille.pipeline.engine.graph import Handle
+    from rille.pipeline.engine.store.artifact import Ref
     from rille.pipeline.engine.store.base import Store
-    from rille.pipeline.engine.store.manifest import Ref
 
 Keys = dict[str, list[str]]
 """Stage and label to keys, the latest first."""

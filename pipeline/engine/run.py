@@ -1,6 +1,6 @@
 """Run a graph: look its tasks up in the cache, give the others to workers, continue its flows as results arrive.
 
->>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=progress.make("auto")))
+>>> result = run(graph, Store("cache"), RunOptions(jobs=2, progress=events.make("auto")))
 >>> result.check()                       # raises the first failure, with its stage and label
 >>> result.counts["cached"]
 8
@@ -25,21 +25,19 @@ import heapq
 import math
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import memory, provenance
-from rille.pipeline.engine.events import Ledger
+from rille.pipeline.engine.events import Ledger, Progress
 from rille.pipeline.engine.failures import translated
-from rille.pipeline.engine.graph import Graph, Handle, Took, Waiting
-from rille.pipeline.engine.progress import Progress
+from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.interrupts import Interrupts
-from rille.pipeline.engine.spec import Refs, key_of, map_ports, recipe
+from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.task import Outcome, code_changed
+from rille.pipeline.engine.task import Outcome, Refs, Took, code_changed, key_of, map_ports, recipe
 from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
 from rille.stages.core.quantities import some
@@ -428,10 +426,10 @@ class _Run:
         if self.stopped or self.suspects:
             return False
         for i, waiting in enumerate(self.graph.waiting):
-            lost = ("failed", "skipped") if waiting.holes else ()
-            if all(h.done or h.earlier or h.status in lost for h in waiting.handles):
+            known = all(h.done or h.earlier or h.status in ("failed", "skipped") for h in waiting.handles)
+            if waiting.go_on is not None and known:
                 del self.graph.waiting[i]
-                self._expand(waiting)
+                self._expand(waiting.handles, waiting.go_on)
                 self._mark_needed()
                 return True
         last = self.graph.last
@@ -442,18 +440,18 @@ class _Run:
         self._mark_needed()
         return True
 
-    def _expand(self, waiting: Waiting) -> None:
-        assumed = [h.label for h in waiting.handles if h.earlier and not h.done]
+    def _expand(self, handles: list[Handle], go_on: Callable[..., None]) -> None:
+        assumed = [h.label for h in handles if h.earlier and not h.done]
         self.result.assumed += assumed
         try:
-            waiting.go_on(*(h.ref or h.earlier for h in waiting.handles))
+            go_on(*(h.ref or h.earlier for h in handles))
         except BrokenPipeError:  # the reader of the flow's output closed it
             raise
         except Exception as error:
             if assumed:  # assumed results of other parameters or images do not fit: the rest is unknown
                 self.result.unknown += assumed
             else:
-                label = f"plan after {_labels(waiting.handles)}"
+                label = f"plan after {_labels(handles)}"
                 self.ledger.note(label, "failed", f"{type(error).__name__}: {error}")
                 self._failed(Failure(label, "", error))
 

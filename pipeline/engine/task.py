@@ -1,26 +1,36 @@
-"""The one body of every task: look up, and if absent compute, check, commit.
+"""A task: what it computes, its key, and the one body of all tasks: look up, and if absent compute, check, commit.
 
-Between tasks only :class:`~rille.pipeline.engine.store.manifest.Ref` travel.
+A :class:`Spec` names a stage by its module, validated parameters, the arguments that
+identify the task, and hints (paths) that cannot change the result. The key is the digest of all of it but the hints
+and the label, of the code and packages behind the stage, and of the *output digests* of the inputs. Between tasks only
+:class:`~rille.pipeline.engine.store.artifact.Ref` travel.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import platform
 import resource
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from operator import attrgetter
 from pathlib import Path
+from typing import Any, TypeVar
 
-from rille.pipeline.engine.graph import Took
-from rille.pipeline.engine.runtime.kernels import COMPILING
-from rille.pipeline.engine.spec import Refs, Spec, key_of, map_ports, recipe
+from rille.pipeline.engine.keys import digest, module_digests, versions
+from rille.pipeline.engine.runtime.kernels import COMPILING, use_own_folder
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import Ref
-from rille.stages.core.declare import check_outputs
+from rille.stages.core.declare import Params, Stage, check_outputs, declared
 from rille.stages.core.errors import RilleError
+
+FORMAT = 5
+"""Enters every key: raise it when the meaning of keys or artifacts changes."""
 
 PAUSES_SECONDS = 0.2, 0.8
 """Before the second try, and before the third."""
@@ -28,10 +38,93 @@ PAUSES_SECONDS = 0.2, 0.8
 PERMANENT = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
-def code_changed() -> RilleError:
-    """The error of a task whose key is another one on the worker."""
-    text = "source code or packages of the worker are not those the run began with"
-    return RilleError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
+Refs = Mapping[str, Ref | list[Ref]]
+"""Input port to the artifact given there, or to the list of them."""
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def map_ports(change: Callable[[A], B], ports: Mapping[str, A | list[A]]) -> dict[str, B | list[B]]:
+    """Apply ``change`` to each item that is given to a port; a list stays a list."""
+    return {p: [change(g) for g in given] if isinstance(given, list) else change(given) for p, given in ports.items()}
+
+
+def flatten_ports(ports: Mapping[str, A | list[A]]) -> list[A]:
+    """All items, in order of the ports."""
+    return [g for given in ports.values() for g in (given if isinstance(given, list) else [given])]
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """One task without its inputs. ``label`` names it to people (``locus/12``) and is not part of the key."""
+
+    module: str
+    label: str
+    params: Params
+    args: Mapping[str, Any] = field(default_factory=dict)
+    hints: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage(self) -> Stage:
+        """The declaration behind the module."""
+        return resolve(self.module)
+
+
+@cache
+def resolve(module: str) -> Stage:
+    """The stage of a module; its source is digested just before the import, so that both see the same files."""
+    module_digests(module)
+    use_own_folder()
+    stage = declared(importlib.import_module(module))
+    if "cv2" in sys.modules:
+        # OpenCV takes a thread a core by default, and there is a worker for each core already.
+        sys.modules["cv2"].setNumThreads(1)
+    if stage is None:
+        raise TypeError(f"{module} declares no stage")
+    return stage
+
+
+def recipe(spec: Spec, refs: Refs) -> dict[str, Any]:
+    """All that determines a result, by name."""
+    return {**_shared(spec.module), **_own(spec, refs)}
+
+
+def key_of(spec: Spec, refs: Refs) -> str:
+    """Key of a task: the digest of its recipe, in which one digest stands for what all tasks of a stage share."""
+    return digest({"stage": _shared_digest(spec.module), **_own(spec, refs)}, spec.label)
+
+
+def _own(spec: Spec, refs: Refs) -> dict[str, Any]:
+    return {"params": spec.params, "args": dict(spec.args), "inputs": map_ports(attrgetter("digest"), refs)}
+
+
+@cache
+def _shared(module: str) -> dict[str, Any]:
+    """What all tasks of a stage have in common."""
+    stage, code, env = resolve(module), module_digests(module), versions(module)
+    return {"code": code, "env": env, "format": FORMAT, "stage": stage.name}
+
+
+@cache
+def _shared_digest(module: str) -> str:
+    return digest(_shared(module), module)
+
+
+@dataclass(frozen=True, slots=True)
+class Took:
+    """What a task took: ``seconds`` and peak memory [bytes] of the call, ``kernel`` seconds of the stage itself.
+
+    ``started`` is when the call began (seconds since 1970); ``compiling`` are the seconds for which it compiled;
+    ``worker`` is the name of the dask worker that ran it.
+    """
+
+    seconds: float = 0.0
+    peak_rss: int = 0
+    started: float = 0.0
+    kernel: float = 0.0
+    compiling: float = 0.0
+    worker: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,6 +134,12 @@ class Outcome:
     ref: Ref
     cached: bool
     took: Took
+
+
+def code_changed() -> RilleError:
+    """The error of a task whose key is another one on the worker."""
+    text = "source code or packages of the worker are not those the run began with"
+    return RilleError("RIL-581", text, remedy="run again, and edit nothing meanwhile")
 
 
 def ensure(root: Path | str, spec: Spec, refs: Refs, *, key: str | None = None, force: bool = False) -> Outcome:

@@ -37,13 +37,17 @@ from typing import Any, cast
 import psutil
 
 from rille.pipeline.engine import foreign
-from rille.pipeline.engine.runtime.apart import ignore_settings, leave_out, take_back
-from rille.pipeline.engine.runtime.environment import prepare_environment, worker_environment
+from rille.pipeline.engine.runtime.environment import (
+    ignore_settings,
+    leave_out,
+    prepare_environment,
+    take_back,
+    worker_environment,
+)
 from rille.pipeline.engine.runtime.interrupts import held
 from rille.pipeline.engine.runtime.private import private_folder
-from rille.pipeline.engine.spec import Refs, Spec, flatten_ports, map_ports
-from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import Outcome, ensure
+from rille.pipeline.engine.store.artifact import Ref
+from rille.pipeline.engine.task import Outcome, Refs, Spec, ensure, flatten_ports, map_ports
 from rille.stages.core.errors import ConfigError, RilleError
 
 KINDS = ("dask", "inline")

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from rille.pipeline.export.view import RunView, by_frame, used_rig
+from rille.pipeline.export.view import RUN, RunView, by_frame, used_rig
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lattice import Lattice
 
@@ -22,10 +22,8 @@ LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in grey (ITU-R BT.601), as in the conversion of the images to grey."""
 
 
-def reads(run: RunView) -> tuple[object, ...]:
-    """Inputs of the colours besides the merged terrain."""
-    p = run.products
-    return p.images, p.trajectory, p.rigs, run.sequence.rig
+READS = (RUN.products.images, RUN.products.trajectory, RUN.products.rigs, RUN.sequence.rig)
+"""Inputs of the colours besides the merged terrain."""
 
 
 def coloured(view: RunView, source: NDArray[Any]) -> bool:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.view import Part, Reads, RunView
+from rille.pipeline.export.view import Names, Part, RunView
 from rille.stages.core.declare import AnyArray, Array, Bundle, Memory, NoParams, Stage
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig, RigidTransform
@@ -55,12 +55,13 @@ class Output:
     opens: str
     write: Writer | None = None
     frame: str = ""
-    needs: Reads = lambda _: ()
-    reads: Reads = lambda _: ()
+    needs: Names = ()
+    reads: Names = ()
 
-    def names(self, run: RunView) -> tuple[object, ...]:
+    @property
+    def names(self) -> Names:
         """All products and facts that it takes of a run."""
-        return *self.needs(run), *self.reads(run)
+        return *self.needs, *self.reads
 
 
 def stage(name: str, summary: str, outputs: Sequence[Output]) -> Stage:

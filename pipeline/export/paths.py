@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import artifact
+from rille.pipeline.export.view import RUN, artifact
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME, axes
 from rille.stages.core.declare import Bundle
 
@@ -126,8 +126,8 @@ OUTPUTS = (
         "QGIS, GDAL",
         lambda path, run: write_path(path, artifact(run, run.products.world_path), run.sequence.georeference),
         "world",
-        lambda run: (run.products.world_path,),
-        lambda run: (run.sequence.georeference,),
+        (RUN.products.world_path,),
+        (RUN.sequence.georeference,),
     ),
 )
 STAGE = stage("output.paths", "The path as a file", OUTPUTS)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import Reads, RunView, artifact
+from rille.pipeline.export.view import RUN, Names, RunView, artifact
 from rille.pipeline.export.writers import ON_PLANE, Meaning, write_raster
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.lattice import Lattice, mosaic, union
@@ -137,17 +137,14 @@ def _vehicle(risk: Bundle) -> dict[str, str]:
     return {"vehicle": json.dumps(risk.meta["vehicle"])}
 
 
-def _terrain(run: RunView) -> tuple[object, ...]:
-    """The merged terrain, as a whole: failed tiles must not look like unknown terrain."""
-    return (run.products.world_tiles,)
+TERRAIN = (RUN.products.world_tiles,)
+"""The merged terrain, as a whole: failed tiles must not look like unknown terrain."""
 
-
-def _world_risk(run: RunView) -> tuple[object, ...]:
-    return (run.products.world_risk,)
+RISK = (RUN.products.world_risk,)
 
 
 def _raster(
-    name: str, what: str, make: Callable[[RunView], Raster], needs: Reads = _terrain, reads: Reads = lambda _: ()
+    name: str, what: str, make: Callable[[RunView], Raster], needs: Names = TERRAIN, reads: Names = ()
 ) -> Output:
     """Row of a raster."""
 
@@ -156,7 +153,7 @@ def _raster(
         cells = {name: v.astype(np.float32) if v.dtype.kind == "f" else v for name, v in bands.items()}
         write_raster(path, cells, lattice, meaning, run.sequence.georeference)
 
-    return Output(name, what, GIS, write, "world", needs, lambda run: (run.sequence.georeference, *reads(run)))
+    return Output(name, what, GIS, write, "world", needs, (RUN.sequence.georeference, *reads))
 
 
 OUTPUTS = (
@@ -168,11 +165,11 @@ OUTPUTS = (
         "ortho.tif",
         "merged ortho image, grey 0..255, or red, green and blue where the images have colours",
         _ortho,
-        reads=colour.reads,
+        reads=colour.READS,
     ),
-    _raster("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _risk, _world_risk),
-    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, needs=_world_risk),
-    _raster("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _hazard, _world_risk),
-    _raster("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _reasons, _world_risk),
+    _raster("risk.tif", "risk map: class 0 safe, 1 caution, 2 hazard, 3 unknown, with colours", _risk, RISK),
+    Output("risk.tif.aux.xml", "names of the classes of risk.tif", GIS, _write_class_names, needs=RISK),
+    _raster("hazard.tif", "probability of a hazard, and the measures in metres and degrees", _hazard, RISK),
+    _raster("reason.tif", "bits of the limits that a cell breaks; whether it was filled", _reasons, RISK),
 )
 STAGE = stage("output.rasters", "Rasters of the terrain and its hazards", OUTPUTS)

@@ -26,7 +26,7 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.export.output import Output, stage
 from rille.pipeline.export.rasters import plane_tag, tiles_of, whole
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RUN, RunView
 from rille.pipeline.export.writers import ENGINEERING_CRS, FRAME, raster_transform
 from rille.stages.core.declare import Array
 from rille.stages.geometry.lattice import Lattice
@@ -120,8 +120,8 @@ OUTPUTS = (
         "xarray.open_zarr, GDAL",
         _write_output,
         "world",
-        lambda run: (run.products.world_tiles,),
-        lambda run: (run.sequence.name, run.sequence.georeference),
+        (RUN.products.world_tiles,),
+        (RUN.sequence.name, RUN.sequence.georeference),
     ),
 )
 STAGE = stage("output.terrain", "The merged terrain as one zarr group", OUTPUTS)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rille.pipeline.export.comparison import crosscheck_poses
+import numpy as np
+
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView, artifact
+from rille.pipeline.export.view import RUN, RunView, artifact, by_frame
 from rille.pipeline.export.writers import FRAME, WORLDS, write_trajectory_kitti, write_trajectory_tum
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle
+from rille.stages.evaluation.agreement import carried
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -38,13 +40,16 @@ def _write_pieces(path: Path, run: RunView) -> None:
             _write_tum(piece, run, world_poses(trajectory, number), number)
 
 
-def _posed(run: RunView) -> tuple[object, ...]:
-    return (run.products.trajectory,)
+def crosscheck_poses(view: RunView, agreement: Bundle) -> Floats:
+    """Poses (frame, 3, 4) of the crosscheck's left cameras in our world, NaN where ours is in another piece."""
+    poses, trajectory = by_frame(view, agreement, "poses"), view.bundle(view.products.trajectory)
+    if trajectory is not None:  # other pieces, with the lost frames after them, have their own frames of reference
+        piece = np.nan_to_num(by_frame(view, trajectory, "piece"), nan=-1).astype(np.int64)
+        poses[carried(piece) != trajectory.meta["main"]] = np.nan
+    return poses
 
 
-def _times(run: RunView) -> tuple[object, ...]:
-    return (run.sequence.times,)
-
+POSED, TIMES = (RUN.products.trajectory,), (RUN.sequence.times,)
 
 OUTPUTS = (
     Output(
@@ -53,7 +58,7 @@ OUTPUTS = (
         "evo (evo_traj kitti), any text editor",
         lambda path, run: write_trajectory_kitti(path, world_poses(_trajectory(run))),
         "world",
-        _posed,
+        POSED,
     ),
     Output(
         "trajectory.tum",
@@ -61,16 +66,16 @@ OUTPUTS = (
         "evo (evo_traj tum), CloudCompare",
         lambda path, run: _write_tum(path, run, world_poses(_trajectory(run))),
         "world",
-        _posed,
-        _times,
+        POSED,
+        TIMES,
     ),
     Output(
         "trajectory.piece*.tum",
         "another unbroken piece of the trajectory, in a frame of its own",
         "evo (evo_traj tum), CloudCompare",
         _write_pieces,
-        needs=_posed,
-        reads=_times,
+        needs=POSED,
+        reads=TIMES,
     ),
     Output(
         "crosscheck.tum",
@@ -78,8 +83,8 @@ OUTPUTS = (
         "evo (evo_ape tum trajectory.tum crosscheck.tum)",
         lambda path, run: _write_tum(path, run, crosscheck_poses(run, artifact(run, run.products.agreement))),
         "world",
-        lambda run: (run.products.agreement, run.products.trajectory),
-        _times,
+        (RUN.products.agreement, *POSED),
+        TIMES,
     ),
 )
 STAGE = stage("output.trajectories", "Trajectories as files", OUTPUTS)

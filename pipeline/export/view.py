@@ -109,15 +109,6 @@ class Part(SimpleNamespace):
         return artifact
 
 
-Reads = Callable[[RunView], tuple[object, ...]]
-"""Names a part of a run, such as ``lambda run: (run.products.trajectory, run.sequence.rig)``."""
-
-
-def names(reads: Reads) -> list[str]:
-    """Dotted names of the attributes that ``reads`` takes, such as ``products.trajectory``."""
-    return [str(name) for name in reads(cast(RunView, _Name()))]
-
-
 def artifact(run: RunView, handle: Any) -> Bundle:
     """The artifact of a handle that has one."""
     bundle = run.bundle(handle)
@@ -144,11 +135,15 @@ def chain(run: RunView) -> tuple[int, ...]:
     return run.frames if bundle is None else tuple(int(f) for f in bundle.meta["chain"])
 
 
-def part(run: RunView, reads: Reads) -> RunView:
-    """The part of a run that ``reads`` names, and its frames, without access to anything else."""
+Names = tuple[object, ...]
+"""Parts of a run, each as :data:`RUN` names it."""
+
+
+def part(run: RunView, names: Names) -> RunView:
+    """The named part of a run, and its frames, without access to anything else."""
     named = Part(frames=run.frames)
-    for name in names(reads):
-        *path, last = name.split(".")
+    for name in names:
+        *path, last = str(name).split(".")
         source: Any = run
         target: Any = named
         for step in path:
@@ -168,3 +163,7 @@ class _Name:
 
     def __str__(self) -> str:
         return self._name
+
+
+RUN = cast(RunView, _Name())
+"""Stands for any run in rows of outputs: ``RUN.products.trajectory`` names that part of it."""

@@ -15,7 +15,7 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 from rille.pipeline.engine.graph import Wait, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow.builders import Builder, Pair
 from rille.stages.evaluation.accuracy import accuracy_stage
 from rille.stages.evaluation.agreement import agreement_stage
@@ -58,10 +58,9 @@ def of_trajectory(make: Builder, frames: Sequence[int]) -> None:
 
 def of_pair(make: Builder, pair: Pair) -> Flow:
     """Compare the disparity of a pair and its local elevation model with the truth."""
-    of_frame = make.sequence.truth_disparity
-    exact_disparity = None if of_frame is None else of_frame(pair.frame)
-    if exact_disparity is not None:
-        true = make.source(exact_disparity, f"truth_disparity/{pair.frame}")
+    exact_disparity = make.sequence.truth_disparity
+    if exact_disparity is not None and (known := exact_disparity(pair.frame)) is not None:
+        true = make.source(known, f"truth_disparity/{pair.frame}")
         make.products.disparity_accuracy[pair.frame] = make.node(
             disparity_accuracy_stage, f"disparity_accuracy/{pair.frame}", disparity=pair.disparity, truth=true
         )

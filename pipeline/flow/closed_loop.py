@@ -41,7 +41,7 @@ from pydantic import Field
 
 from rille.datasets.protocol import Sequence, Simulation
 from rille.pipeline.engine.graph import Graph, Handle, MissingError, Wait, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow.builders import Builder, Pair, Segment, name_graph
 from rille.pipeline.flow.products import Driven, Products, Stop
 from rille.pipeline.flow.reconstruction import reconstruction

@@ -58,7 +58,7 @@ import numpy as np
 
 from rille.datasets.protocol import CAMERAS
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, Wait, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.assessment import Flow
 from rille.pipeline.flow.builders import BasicPair, Builder, Pair, Segment, other_plane

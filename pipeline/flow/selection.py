@@ -13,7 +13,7 @@ from itertools import groupby, pairwise
 from typing import Any
 
 from rille.pipeline.engine.graph import Complete, Handle, Wait, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow.builders import Builder, Segment
 from rille.stages.facts.calibration import CalibrationFacts, RigFacts, SynchronyFacts
 from rille.stages.facts.odometry import KeyframesFacts, ResectFacts, ScreeningFacts, StepTableFacts

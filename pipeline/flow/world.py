@@ -12,7 +12,7 @@ from collections.abc import Sequence as Series
 from typing import Any
 
 from rille.pipeline.engine.graph import Complete, Handle, Maybe, done
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.flow import assessment
 from rille.pipeline.flow.assessment import Flow
 from rille.pipeline.flow.builders import Builder, Pair

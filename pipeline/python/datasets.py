@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rille.pipeline.engine.store.cf_coordinates import DIMS, coordinates, lattice_of
+from rille.pipeline.engine.store.arrays import DIMS, coordinates, lattice_of
 from rille.pipeline.flow import config
 from rille.pipeline.python.arguments import Settings
 from rille.stages.core.declare import AnyArray, Array, Bundle, Stage

@@ -17,7 +17,7 @@ from rille.datasets.images.files import sound
 from rille.datasets.protocol import CAMERAS, Sequence
 from rille.pipeline.engine.graph import Graph, Handle
 from rille.pipeline.engine.runtime.environment import prepare_environment
-from rille.pipeline.engine.spec import map_ports
+from rille.pipeline.engine.task import map_ports
 from rille.pipeline.flow import config
 from rille.pipeline.python.arguments import Settings, assignments, place_of
 from rille.pipeline.python.datasets import carried

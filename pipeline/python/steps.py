@@ -86,9 +86,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     """
     prepare_environment()
     from rille.pipeline.flow import tiles
-    from rille.pipeline.runs.doubts import doubts, levelled
+    from rille.stages.calibration.doubt import doubts
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
     from rille.stages.imaging import pyramid
+    from rille.stages.imaging.levels import levelled
 
     carried, marks = settings_of(left), [mark for image in (left, right) for mark in noted(image).get("images", [None])]
     built: Any = config.build(carried, {"hfvm": hfvm})
@@ -241,8 +242,8 @@ def terrain(
         Of :func:`match`, of this pair; pixels that :meth:`xarray.Dataset.where` masks count as unmatched. Enough are
         ``column_disparity`` and ``row_disparity`` (row, col), right minus left, px, NaN unknown: without ``validity``
         all known pixels count as matched, without ``disparity_std`` their standard deviation is
-        ``locus.sigma_disparity``. Settings of :func:`match` hold for the right image, too, which is matched here;
-        without the attribute ``rille``, which xarray may drop, those of the sequence do.
+        ``locus.sigma_disparity``. Without the attributes of :func:`match` parameters are those of the sequence, not
+        those that go with its preset.
     pair
         The pair.
     reference
@@ -256,8 +257,8 @@ def terrain(
     -------
     xarray.Dataset
         Of each cell (row, col), float32, NaN undefined: ``elevation`` and ``elevation_std`` (m), ``ortho``, grey value
-        0..255 of the left image, and ``residual`` (px), mismatch of disparity and calibration. Coordinates ``x`` (col)
-        and ``y`` (row) are those of the cells' centres (m); y falls from row to row.
+        0..255 of the left image. Coordinates ``x`` (col) and ``y`` (row) are those of the cells' centres (m); y falls
+        from row to row.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from rille.pipeline.report import canvas, ranges
+from rille.pipeline.report import canvas
 from rille.pipeline.report.canvas import Panel
 from rille.stages.core.arrays import Floats
 
@@ -24,7 +24,7 @@ MAX_MARKERS = 80
 
 def metres_or_mm(values: Floats) -> tuple[float, str]:
     """Factor and unit that suit lengths in metres: mm where nearly all are below 0.2 m."""
-    finite = np.abs(ranges.sample(values))
+    finite = np.abs(canvas.sample(values))
     return (1000.0, "mm") if finite.size and float(np.percentile(finite, 98)) < 0.2 else (1.0, "m")
 
 
@@ -87,7 +87,7 @@ def raster(values: Floats, label: str, alt: str, *, extent: Extent | None = None
     ``extent``: where it lies, m; None for an image. ``bound``: the scale is symmetric about zero and ends there.
     """
     fig, (ax,) = canvas.sheet(height=min(values.shape[0] / values.shape[1], 1.3) + 0.2)
-    low, high = ranges.limits(values) if bound is None else (-bound, bound)
+    low, high = canvas.limits(values) if bound is None else (-bound, bound)
     colors = "viridis" if bound is None else "PuOr"
     drawn = ax.imshow(values, extent=extent, cmap=colors, vmin=low, vmax=high)
     ax.grid(visible=False)

@@ -9,12 +9,11 @@ import numpy as np
 
 from rille.pipeline.export import colour
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import Reads, RunView
-from rille.pipeline.report import canvas, figures, gather, ranges, strips, tables, terrain_map
-from rille.pipeline.report.canvas import FIGURE, Block, Figure
+from rille.pipeline.export.view import RUN, Names, RunView
+from rille.pipeline.report import canvas, figures, gather, strips, tables, terrain_map
+from rille.pipeline.report.canvas import FIGURE, Block, Figure, spread
 from rille.pipeline.report.figures import Curve, Plot
 from rille.pipeline.report.gather import Scene
-from rille.pipeline.report.ranges import spread
 from rille.stages.core.errors import RilleError
 
 Maker = Callable[[Scene], Block | None]
@@ -85,7 +84,7 @@ def _rig(scene: Scene) -> Block | None:
     calibration, left = scene.calibration, scene.view.sequence.rig.left
     if calibration is None or not len(calibration.before):
         return None
-    bound = max(0.3, ranges.limits(np.abs(calibration.before), 0, 99)[1])
+    bound = max(0.3, canvas.limits(np.abs(calibration.before), 0, 99)[1])
     panels = []
     for name, values in (("given", calibration.before), ("used", calibration.after))[: 1 + calibration.changed]:
         label, alt = f"distance from epipolar line, px: {name} rig", f"Residuals, {name} rig: {spread(values)} px"
@@ -101,7 +100,7 @@ def _elevation_error(scene: Scene) -> Block | None:
         return None
     factor, unit = figures.metres_or_mm(error.arrays["error"])
     values = error.arrays["error"] * factor
-    alt, bound = f"Elevation minus truth, {spread(values)} {unit}", ranges.limits(np.abs(values), 0, 97)[1]
+    alt, bound = f"Elevation minus truth, {spread(values)} {unit}", canvas.limits(np.abs(values), 0, 97)[1]
     label = f"elevation minus truth, {unit}"
     return Block((figures.raster(values, label, alt, extent=error.lattice.bounds, bound=bound),))
 
@@ -116,7 +115,7 @@ def draw(title: str, maker: Maker, view: RunView) -> Figure:
         return Figure(title, why=f"drawing failed, {type(error).__name__}: {error}")
 
 
-def _drawing(title: str, maker: Maker, reads: Reads) -> Output:
+def _drawing(title: str, maker: Maker, reads: Names) -> Output:
     """Row of a figure: a part of the page, kept as JSON."""
 
     def write(path: Path, run: RunView) -> None:
@@ -125,34 +124,21 @@ def _drawing(title: str, maker: Maker, reads: Reads) -> Output:
     return Output(title, "", "", write, reads=reads)
 
 
-def _of_map(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    drawn = p.world_tiles, p.world_risk, p.world_path, p.drive, p.disparity, p.accuracy, run.config.vehicle
-    return *drawn, *colour.reads(run)
-
-
-def _of_stops(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    return p.disparity, p.images, p.local_dem, p.local_risk, p.local_path, run.sequence.rig
-
-
-def _of_trajectory(run: RunView) -> tuple[object, ...]:
-    p = run.products
-    return p.trajectory, p.agreement, p.accuracy, p.crosscheck_accuracy
-
+P = RUN.products
+OF_MAP = (
+    *(P.world_tiles, P.world_risk, P.world_path, P.drive, P.disparity, P.accuracy, RUN.config.vehicle),
+    *colour.READS,
+)
+OF_STOPS = (P.disparity, P.images, P.local_dem, P.local_risk, P.local_path, RUN.sequence.rig)
 
 OUTPUTS = (
-    _drawing("Map", terrain_map.block, _of_map),
-    _drawing(
-        "Drive",
-        strips.drive,
-        lambda run: (run.products.drive, run.products.images, run.products.trajectory, run.products.accuracy),
-    ),
-    _drawing("Stops", strips.pairs, _of_stops),
-    _drawing("Rig", _rig, lambda run: (run.products.rigs, run.products.orientations, run.sequence.rig)),
-    _drawing("Trajectory", _trajectory, _of_trajectory),
-    _drawing("Pairs", _pairs, lambda run: tables.of_pairs(run.products)),
-    _drawing("Elevation error", _elevation_error, lambda run: (run.products.dem_accuracy,)),
+    _drawing("Map", terrain_map.block, OF_MAP),
+    _drawing("Drive", strips.drive, (P.drive, P.images, P.trajectory, P.accuracy)),
+    _drawing("Stops", strips.pairs, OF_STOPS),
+    _drawing("Rig", _rig, (P.rigs, P.orientations, RUN.sequence.rig)),
+    _drawing("Trajectory", _trajectory, (P.trajectory, P.agreement, P.accuracy, P.crosscheck_accuracy)),
+    _drawing("Pairs", _pairs, tables.OF_PAIRS),
+    _drawing("Elevation error", _elevation_error, (P.dem_accuracy,)),
 )
-"""All figures of the page; the template places them."""
+"""All figures of the page, each with what it reads of a run; the template places them."""
 STAGE = stage("output.figures", "Figures of the report", OUTPUTS)

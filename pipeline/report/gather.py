@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.pipeline.export.comparison import CrosscheckComparison, compare
 from rille.pipeline.export.rasters import whole
+from rille.pipeline.export.trajectories import crosscheck_poses
 from rille.pipeline.export.view import RunView, by_frame, used_rig
 from rille.pipeline.flow.products import Stop
 from rille.stages.core.arrays import Floats
@@ -58,6 +58,47 @@ class Track:
     def in_world(self) -> NDArray[np.bool_]:
         """Frames that have a pose in the world."""
         return np.asarray(np.isfinite(self.left).all(axis=1))
+
+
+@dataclass(frozen=True)
+class CrosscheckComparison:
+    """Our trajectory and the crosscheck's, one row for each chosen frame, NaN where either has no pose.
+
+    ``poses`` (frame, 3, 4): the crosscheck's left cameras in our world, NaN where ours is in another piece.
+    ``registered`` (frame,): whether the crosscheck has a pose, in any piece. ``distance`` m, ``angle`` rad:
+    disagreement of the poses; ``step_distance``, ``step_angle``: of the motion since the frame before.
+    ``error_crosscheck`` m: its distance from the truth, first poses equal. ``flagged``: the pose may be wrong.
+    """
+
+    poses: Floats
+    registered: NDArray[np.bool_]
+    distance: Floats
+    angle: Floats
+    step_distance: Floats
+    step_angle: Floats
+    flagged: NDArray[np.bool_]
+    error_crosscheck: Floats
+    meta: Mapping[str, Any]
+
+
+def compare(view: RunView, agreement: Bundle) -> CrosscheckComparison:
+    """The comparison by an artifact of stage ``agreement``."""
+    return CrosscheckComparison(
+        poses=crosscheck_poses(view, agreement),
+        registered=rigid.posed(by_frame(view, agreement, "poses")),
+        flagged=np.nan_to_num(by_frame(view, agreement, "flagged")) > 0,
+        error_crosscheck=_error(view, view.bundle(view.products.crosscheck_accuracy)),
+        meta=agreement.meta,
+        **{name: by_frame(view, agreement, name) for name in ("distance", "angle", "step_distance", "step_angle")},
+    )
+
+
+def _error(view: RunView, accuracy: Bundle | None) -> Floats:
+    """Distance (frame,) from the truth, m, first poses equal."""
+    if accuracy is None:
+        return np.full(len(view.frames), np.nan)
+    ours, true = (by_frame(view, accuracy, name) for name in ("position", "position_truth"))
+    return np.asarray(np.linalg.norm(ours - true, axis=1))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from rille.pipeline.export.view import artifact
 from rille.pipeline.flow.products import Stop
-from rille.pipeline.report import canvas, gather, ranges
+from rille.pipeline.report import canvas, gather
 from rille.pipeline.report.canvas import Block, Panel
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.stages.core.arrays import Floats
@@ -164,7 +164,7 @@ def matches_picture(photo: Image.Image, disparity: Bundle, rig: Rig) -> Image.Im
     there, pixels = matched(validity[at]), np.stack(np.meshgrid(*map(np.ravel, at[::-1])), -1).reshape(-1, 2)
     shift = np.stack([np.asarray(disparity[f"{name}_disparity"])[at].ravel() for name in ("column", "row")], -1)
     near = inverse_depth(rig, pixels.astype(np.float64), shift)[0].reshape(there.shape)
-    low, high = ranges.limits(np.where(there, near, np.nan))
+    low, high = canvas.limits(np.where(there, near, np.nan))
     colors, ground = _colors((near - low) / max(high - low, 1e-9)), np.asarray(photo.convert("RGB"))
     # Divided before multiplied: bytes would overflow the other way round.
     return Image.fromarray(np.where(there[..., None], colors // 3 * 2 + ground // 3, ground)).convert("RGBA")
@@ -172,7 +172,7 @@ def matches_picture(photo: Image.Image, disparity: Bundle, rig: Rig) -> Image.Im
 
 def _elevations(dem: WorldTerrain, lines: Sequence[StripLine], width: int) -> Image.Image:
     elevation = dem.arrays["elevation"]
-    low, high = ranges.ground_limits(elevation)
+    low, high = canvas.ground_limits(elevation)
     alpha = np.where(np.isfinite(elevation), 255, 0).astype(np.uint8)
     colors = _colors((elevation - low) / max(high - low, 1e-9))
     return _with_lines(Image.fromarray(np.dstack([colors, alpha])), dem, lines, width)

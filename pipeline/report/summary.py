@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from rille.pipeline.export.output import Output, stage
-from rille.pipeline.export.view import RunView
+from rille.pipeline.export.view import RUN, RunView
 from rille.pipeline.flow.products import Products
 from rille.pipeline.report import delivery, tables
 from rille.pipeline.report.canvas import Figure
@@ -414,15 +414,13 @@ NOT_IN_FACTS = ("images", "world_dem")
 """Products that the facts are not made of."""
 
 
-def _reads(run: RunView) -> tuple[object, ...]:
-    s, config = run.sequence, run.config
-    return (
-        *(getattr(run.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
-        *(config.vehicle, config.rig.significance, config.crosscheck.enabled),
-        *(s.name, s.frames, s.frame_names, s.rig, s.truth, s.truth_source, s.truth_positions, s.warnings, s.notes),
-        *(s.evaluation_window, s.georeference, s.times, s.pitch, s.attitude, s.imu_axes, s.loose_odometry),
-    )
+S, CONFIG = RUN.sequence, RUN.config
+READS = (
+    *(getattr(RUN.products, product.name) for product in fields(Products) if product.name not in NOT_IN_FACTS),
+    *(CONFIG.vehicle, CONFIG.rig.significance, CONFIG.crosscheck.enabled),
+    *(S.name, S.frames, S.frame_names, S.rig, S.truth, S.truth_source, S.truth_positions, S.warnings, S.notes),
+    *(S.evaluation_window, S.georeference, S.times, S.pitch, S.attitude, S.imu_axes, S.loose_odometry),
+)
 
-
-OUTPUTS = (Output("facts", "", "", _write, reads=_reads),)
+OUTPUTS = (Output("facts", "", "", _write, reads=READS),)
 STAGE = stage("output.facts", "Figures and tables of the report in numbers", OUTPUTS)

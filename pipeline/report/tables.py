@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rille.pipeline.export.view import chain
-from rille.pipeline.flow.products import Products
+from rille.pipeline.export.view import RUN, chain
 from rille.pipeline.report import gather
 from rille.pipeline.report.gather import facts_of
 from rille.stages.odometry.resection.loop import closure
@@ -74,12 +73,12 @@ def loops(scene: gather.Scene) -> dict[str, list[Row]]:
     return {"loops": rows, "loops_refused": [row for meta in facts for row in meta["refused"]]}
 
 
-def of_pairs(p: Products) -> tuple[object, ...]:
-    """Products that :func:`pairs` reads."""
-    return (
-        *(p.keyframes, p.screening, p.orientations, p.disparity, p.level, p.local_dem, p.local_risk, p.local_path),
-        *(p.disparity_accuracy, p.local_dem_accuracy, p.seams),
-    )
+P = RUN.products
+OF_PAIRS = (
+    *(P.keyframes, P.screening, P.orientations, P.disparity, P.level, P.local_dem, P.local_risk, P.local_path),
+    *(P.disparity_accuracy, P.local_dem_accuracy, P.seams),
+)
+"""Products that :func:`pairs` reads."""
 
 
 def pairs(scene: gather.Scene) -> list[Row]:

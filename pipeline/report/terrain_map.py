@@ -18,7 +18,7 @@ from PIL import Image
 
 from rille.pipeline.export import colour
 from rille.pipeline.export.view import artifact
-from rille.pipeline.report import canvas, gather, ranges, strips
+from rille.pipeline.report import canvas, gather, strips
 from rille.pipeline.report.canvas import Block
 from rille.pipeline.report.gather import Scene, WorldTerrain
 from rille.pipeline.report.strips import StripLine
@@ -76,7 +76,7 @@ def data(scene: Scene) -> dict[str, Any] | None:
         "cell": world.lattice.cell * step,
         "thinned": step,
         "z": [low, max(high - low, 1e-9)],
-        "shown": [float(v) for v in ranges.ground_limits(z)],
+        "shown": [float(v) for v in canvas.ground_limits(z)],
         "sigma": sigmas,
         "judged": scene.risk is not None,
         "reasons": {name: int(bit) for name, bit in REASONS.items()},
@@ -129,7 +129,7 @@ def _ortho(scene: Scene, world: WorldTerrain, step: int) -> str:
     if colour.coloured(scene.view, world.arrays["source"]):
         rgb = colour.ortho(scene.view, world.lattice, world.arrays)[::step, ::step].astype(np.float64)
         look = np.where(rgb > 0, rgb, np.nan)
-    low, high = ranges.limits(look, 0.5, 99.5)
+    low, high = canvas.limits(look, 0.5, 99.5)
     stretched = np.clip((np.nan_to_num(look, nan=low) - low) / (high - low) * 255, 0, 255)
     return canvas.compressed(Image.fromarray(stretched.astype(np.uint8)), "jpeg", quality=82)
 

@@ -61,10 +61,10 @@ class Settings:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Work(Settings):
-    """:class:`Settings`, and options that choose the part that is made, and where tasks run.
+class Options(Settings):
+    """:class:`Settings`, and options that choose where tasks run, the part that is made, and the messages during a run.
 
-    ``executor`` may also be a ``Client`` of dask. With ``runs``, so that a plan takes the command line of its run.
+    A plan takes them all, so that it takes the command line of its run. ``executor`` may also be a ``Client`` of dask.
 
     Parameters
     ----------
@@ -76,10 +76,16 @@ class Work(Settings):
         Where tasks run: dask (a cluster of this machine), inline, or a dask scheduler's address, tcp://host:port.
     memory_limit
         Memory that a run may use in total, for example 6GB or 75%; by default 90 % of what is free.
+    keep_going
+        After a failure, finish all tasks that do not depend on it; the exit status is then 3.
     until
         Compute a stage's tasks and what they need, nothing else; may be repeated.
     only
         Make a file, for example dem.tif, and what it needs, nothing else; may be repeated.
+    progress
+        How progress is shown on stderr.
+    quiet
+        The same as --progress quiet: warnings and errors only.
     """
 
     jobs: int | None = None
@@ -87,32 +93,15 @@ class Work(Settings):
     executor: Any = "dask"
     memory_limit: str | None = None
     runs: Runs = RUNS
+    keep_going: Annotated[bool, FLAG] = False
     until: Annotated[tuple[str, ...], SEVERAL] = ()
     only: Annotated[tuple[str, ...], SEVERAL] = ()
+    progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
+    quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
 
     def part(self) -> str:
         """The options that choose a part of the run, as typed; empty: all of it."""
         return " ".join([*(f"--until {name}" for name in self.until), *(f"--only {name}" for name in self.only)])
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class Options(Work):
-    """:class:`Work`, and options of failures and of the messages during a run.
-
-    Parameters
-    ----------
-    keep_going
-        After a failure, finish all tasks that do not depend on it; the exit status is then 3.
-    progress
-        How progress is shown on stderr.
-    quiet
-        The same as --progress quiet: warnings and errors only.
-    """
-
-    keep_going: Annotated[bool, FLAG] = False
-    progress: Literal["auto", "bar", "plain", "quiet"] = "auto"
-    quiet: Annotated[bool, FLAG, Parameter(name=["--quiet", "-q"])] = False
 
     def command(self, verb: str, *opened: str) -> str:
         """The command line, for a shell, that repeats a run of a sequence (``Sequence.opened``), in one line."""
@@ -154,7 +143,7 @@ class WatchOptions(Options):
 
 def cache_folder(given: str | Path | None) -> Path:
     """Return the folder of the artifact cache: ``--cache``, else ``RILLE_CACHE``, else ``.rille/cache`` here."""
-    from rille.pipeline.engine.store.folder import locate
+    from rille.pipeline.engine.store.base import locate
 
     return locate(given or os.environ.get("RILLE_CACHE") or Path(".rille/cache"))
 

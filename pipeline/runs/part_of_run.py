@@ -6,7 +6,6 @@ from collections.abc import Collection
 
 from rille.pipeline.engine.graph import Cut
 from rille.pipeline.export import catalogue
-from rille.pipeline.export.view import names
 from rille.pipeline.flow import config
 from rille.pipeline.runs.lookup import refuse_unknown
 from rille.stages.core.errors import ConfigError
@@ -48,6 +47,6 @@ def cut(until: Collection[str], only: Collection[str]) -> Cut | None:
         return Cut(frozenset(until), lambda h: h.stage in wanted or h.label.partition("/")[0] in wanted)
     if not only:
         return None
-    read = {name.removeprefix("products.") for file in only for name in names(files[file].names)}
+    read = {str(name).removeprefix("products.") for file in only for name in files[file].names}
     behind = {MADE_BY.get(name, name) for name in read} & stages or {"trajectory"}
     return Cut(frozenset(behind), lambda h: h.label.partition("/")[0] in wanted)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import is_dataclass
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,8 +17,8 @@ from rille.pipeline.engine.graph import Graph, Handle, Maybe, Wait
 from rille.pipeline.engine.plain import one_line, warn
 from rille.pipeline.engine.run import Failure
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.task import ensure
 from rille.pipeline.export import catalogue
 from rille.pipeline.export.output import FORMS, Output, unpack
@@ -58,10 +59,9 @@ def _is_wanted(output: Output, view: RunView, graph: Graph) -> bool:
 
 def plan(graph: Graph, view: RunView) -> None:
     """Add the task of each output that a run would make; ``view`` is known without a computation."""
-    for module in MODULES if graph.cut is None else catalogue.MADE:
+    for module in MODULES:
         for output in module.OUTPUTS:
-            if graph.cut is None or _is_wanted(output, view, graph):
-                add(graph, module, output, view)
+            add(graph, module, output, view)
 
 
 def _make(graph: Graph, view: RunView, module: ModuleType, output: Output, made: Made) -> Generator[Wait, Any, None]:
@@ -82,10 +82,11 @@ def handles(output: Output, run: RunView) -> list[Handle]:
 
 def add(graph: Graph, module: ModuleType, output: Output, run: RunView) -> Handle | None:
     """Add the task that makes an output of ``module``; None if a product that it needs is missing."""
-    if not all(needed and all(map(_due, _handles(needed))) for needed in output.needs(run)):
+    taken, there = part(run, output.names), dict[Handle, int]()
+    needed = (attrgetter(str(name))(taken) for name in output.needs)
+    if not all(value and all(map(_due, _handles(value))) for value in needed):
         return None
-    there: dict[Handle, int] = {}
-    args = {"file": output.name, "run": _form(part(run, output.names), there, _due)}
+    args = {"file": output.name, "run": _form(taken, there, _due)}
     return graph.node(module.__name__, f"output/{output.name}", NoParams(), args, {}, {"read": list(there)})
 
 

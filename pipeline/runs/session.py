@@ -20,26 +20,26 @@ from rille.datasets.images.files import Digests
 from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
-from rille.pipeline.engine import events, memory, progress
+from rille.pipeline.engine import events, memory
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine.code_digest import remember
 from rille.pipeline.engine.failures import reason_of
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.packages import installed
+from rille.pipeline.engine.keys import installed, remember
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
+from rille.pipeline.engine.store.maintenance import note_runs
 from rille.pipeline.engine.workers import Workers, check
 from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
 from rille.pipeline.report.delivery import lacking, left_out
-from rille.pipeline.runs import part_of_run, roots, run_files
+from rille.pipeline.runs import part_of_run, run_files
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
-from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, Work, cache_folder
+from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError, warning, within
 from rille.stages.odometry.resection.trajectory import trajectory_stage
 
@@ -90,7 +90,7 @@ def settings(sequence: str | Sequence, options: Settings) -> Settled:
     return Settled(sequence=sequence, frames=frames, config=config, vehicle_source=source, given=given)
 
 
-def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str], None] = warn) -> Settled:
+def settings_of_run(sequence: str | Sequence, options: Options, warn: Callable[[str], None] = warn) -> Settled:
     """As :func:`settings`, for a run: refuse unusable settings; ``warn`` takes warnings about suspicious ones."""
     # Before anything is read or written.
     if options.force:
@@ -113,7 +113,7 @@ def settings_of_run(sequence: str | Sequence, options: Work, warn: Callable[[str
     return replace(settled, sequence=sequence)
 
 
-def memory_limit(options: Work) -> int | None:
+def memory_limit(options: Options) -> int | None:
     """Bytes that a run may use in total; None: what is free."""
     return None if options.memory_limit is None else memory.parse(options.memory_limit)
 
@@ -259,7 +259,7 @@ def _open(given: str | Sequence, options: Options, verb: str, warn: Callable[[st
 def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
     """Run the graph; raise the first failure, unless the data are its cause and there are poses."""
     options, view = opened.options, opened.view
-    roots.note(opened.store, options.runs)
+    note_runs(opened.store, options.runs)
     result = driver.run(
         opened.graph,
         opened.store,
@@ -269,7 +269,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / LEDGER,
-            progress=progress.make("quiet" if options.quiet else options.progress),
+            progress=events.make("quiet" if options.quiet else options.progress),
             memory_limit=memory_limit(options),
             kept=kept,
         ),

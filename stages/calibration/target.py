@@ -9,7 +9,7 @@ errors of the relative pose, and because a bad view must show in its own residua
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import DegenerateError, InputError
+from rille.stages.core.errors import DegenerateError, InputError, warning
 from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, Sizes, orthonormal, rotation_exp
 from rille.stages.geometry.lens import COEFFICIENTS, Lens
@@ -383,3 +383,56 @@ def _apart(a: RigidTransform, b: RigidTransform) -> float:
     size = float(np.linalg.norm(a.translation) + np.linalg.norm(b.translation))
     away = float(np.linalg.norm(a.translation - b.translation)) / max(size, 1e-12)
     return float(angle(a.rotation @ b.rotation.T)) + away
+
+
+def refuse_clutter(rig: RigCalibration, views: Sequence[BoardView], corners: tuple[int, int]) -> None:
+    """Refuse corners, so many in columns and rows, that are not those of a flat board.
+
+    Raises
+    ------
+    InputError
+        Their residuals are too large for the distances between them.
+    """
+    columns, rows = corners
+    grids = [p.reshape(rows, columns, 2) for v in views for p in (v.left, v.right)]
+    spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
+    # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
+    # hundredths; at any resolution and distance.
+    if rig.rms > 0.1 * spacing:
+        text = f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS"
+        doubt = f"{spacing:.0f} px apart: no flat board, or not the same moment left and right"
+        remedy = "give pictures of a chessboard, and its inner corners, e.g. --corners 9x6"
+        raise InputError("RIL-800", f"{text}, {doubt}", remedy=remedy)
+
+
+def cover(points: Sequence[Floats], size: tuple[int, int]) -> float:
+    """Share of an image within the convex hull of all corners."""
+    hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
+    return float(cv2.contourArea(hull)) / (size[0] * size[1])
+
+
+def doubts(rig: RigCalibration, views: Sequence[BoardView], sizes: Sizes, model: str) -> Iterator[str]:
+    """Reasons to doubt the result, one line each with its figure."""
+    # 1.0 px: a chessboard on paper leaves less.
+    if rig.rms > 1.0:
+        text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
+        yield warning("RIL-696", text)
+    used = [view for view, r in zip(views, rig.residuals, strict=True) if r.used]
+    for side, size in zip(("left", "right"), sizes, strict=True):
+        share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
+        # 0.01: all depths have this relative error.
+        if share > 0.01:
+            text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
+            yield warning("RIL-697", text)
+        seen = cover([getattr(view, side) for view in used], size)
+        # Beyond the corners, distortion is extrapolated.
+        if seen < 0.5:
+            text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
+            yield warning("RIL-698", text)
+        known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
+        vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
+        if vague:
+            # These views may determine a model with fewer terms.
+            fewer = "radtan" if model == "rational" else "radtan4"
+            text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
+            yield warning("RIL-699", text)

@@ -10,7 +10,9 @@ from ground that has not changed; a change whose volume is less than :data:`SURE
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import scipy
@@ -111,3 +113,23 @@ def _shared(ratio: Floats, still: Bools) -> float:
     if len(whole) <= BLOCK or whole.var() == 0:
         return 1.0
     return max(1.0, BLOCK**2 * float(whole.mean(axis=1).var() / whole.var()))
+
+
+def listed(error: Floats, grid: Grid, sigmas: Sequence[Floats | None]) -> tuple[Floats, dict[str, Any]]:
+    """Standard deviation (rows, cols), m, of differences on a grid, and a list (JSON-able) of the changes.
+
+    ``sigmas``: standard deviations (rows, cols), m, of the models, as far as they are known.
+    """
+    stated = np.sqrt(sum((sigma**2 for sigma in sigmas if sigma is not None), np.zeros(error.shape)))
+    deviation = standard_deviation(error, stated, np.hypot(*grid.slopes()), grid.cell)
+    found, total = changes(error, deviation, grid), {}
+    for way, sign in (("rose", 1), ("fell", -1)):
+        of = [one for one in found if sign * one.volume_m3 > 0]
+        sigma_m3 = math.hypot(*(one.sigma_m3 for one in of))
+        total[way] = {"volume_m3": sum(one.volume_m3 for one in of), "sigma_m3": sigma_m3}
+    how = (
+        f"patches of cells that differ one way by {BESIDE:g} standard deviations, one of them by {SURE:g}, their "
+        f"volume by {SURE_VOLUME:g} of its own; standard deviations of both models and of a shift by {SHIFT_CELLS:g} "
+        "cells, scaled up where most differences spread more"
+    )
+    return deviation, {"total": total, "patches": [asdict(one) for one in found], "how": how}

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import DegenerateError, InputError
-from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.geometry import RigidTransform, rotation_log
 from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, mad_sigma
 from rille.stages.terrain.relief.grid import Grid
 from rille.stages.terrain.relief.height_fit import MAX_ROUNDS, MIN_EIGENVALUE, FitRules, condition, lay
@@ -170,3 +171,73 @@ def binned(error: Floats, by: Floats, edges: Floats) -> list[dict[str, float]]:
         for low, high in itertools.pairwise(edges)
     ]
     return [one for one in bins if one["cells"]]
+
+
+def assess(a: Grid, b: Grid, kind: Align | None, cameras: Floats | None) -> tuple[dict[str, Any], Floats, Grid]:
+    """Figures (JSON-able) of A against the reference B, errors, m, on the common cells (rows, cols), and B on them.
+
+    Parameters
+    ----------
+    kind : motion that aligns A first; None: none.
+    cameras : positions (n, 2), m, from the nearest of which the range is counted; None: it is unknown.
+
+    Raises
+    ------
+    InputError
+        There is no common known cell.
+    DegenerateError
+        The terrain does not determine the alignment.
+    """
+    on_a, on_b, how = common(a, b)
+    facts: dict[str, Any] = {"resampling": how}
+    pose = None
+    if kind is not None:
+        facts["before_alignment"] = figures(errors(on_a, on_b))
+        alignment = align(on_a, on_b, kind)
+        facts["alignment"], pose = _facts_of(alignment, kind), alignment.pose
+    error = errors(on_a, on_b, pose)
+    facts["figures"] = figures(error)
+    known = np.isfinite(error)
+    if not known.any():
+        text = "no cell is left that both know"
+        raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
+    facts["completeness"] = _completeness(error, on_b, a)
+    slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
+    facts["by_slope"] = binned(error, slope, np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0]))
+    facts["by_range"] = []
+    if cameras is not None and len(cameras):
+        distance = np.asarray(cKDTree(cameras).query(on_b.centres())[0], np.float64)
+        # Bins are open at their upper end: 1e-9 more, so that the last one holds the farthest cell.
+        edges = np.linspace(0.0, float(distance[known].max()) * (1.0 + 1e-9), 9)
+        facts["by_range"] = binned(error, distance, edges)
+    return facts, error, on_b
+
+
+def _facts_of(alignment: Alignment, kind: Align) -> dict[str, Any]:
+    """Facts (JSON-able) of the motion that aligned A."""
+    names = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "about_z_deg")
+    start = alignment.pose.inverse().apply(alignment.centre)
+    values = [*(alignment.centre - start), *np.degrees(rotation_log(alignment.pose.rotation))]
+    sigma = [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
+    return {
+        "kind": kind,
+        "motion_of_a": {names[k]: float(values[k]) for k in FREE[kind]},
+        "sigma": {names[k]: float(sigma[k]) for k in FREE[kind]},
+        "centre_m": start.tolist(),
+        "how": "x_b = R (x_a - centre) + centre + t; least squares of the elevation differences, Tukey's biweight",
+        "iterations": alignment.rounds,
+        "points": alignment.points,
+    }
+
+
+def _completeness(error: Floats, on_b: Grid, a: Grid) -> dict[str, Any]:
+    """Share of compared cells of B: of all, and of those whose centres lie in the outline of A."""
+    compared, known, index = int(np.isfinite(error).sum()), np.isfinite(on_b.values), a.index(on_b.centres())
+    inside = ((index >= -0.5) & (index <= np.array(a.values.shape) - 0.5)).all(axis=-1)
+    within = int((known & inside).sum())
+    return {
+        "of_b": min(compared / known.sum(), 1.0),
+        "of_b_within_a": min(compared / max(within, 1), 1.0),
+        "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
+        "within the outline of A",
+    }

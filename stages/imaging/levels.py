@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 
 from rille.stages.core.declare import AnyArray
+from rille.stages.core.errors import warning
 
 Levels = tuple[int | None, int]
 """Black and gain: samples become ``(sample - black) * gain``; those beyond the range are clipped. Black None: each
@@ -99,3 +100,10 @@ def _shows(image: AnyArray) -> bool:
     image = np.clip(image, *np.percentile(image, OUTLYING)).astype(np.float32)
     # Means of 4 x 4 pixels reduce the standard deviation of noise to a quarter.
     return bool(cv2.blur(image, (4, 4)).std() > 0.5 * image.std())
+
+
+def levelled(images: Sequence[AnyArray]) -> tuple[list[AnyArray], list[str]]:
+    """Left and right image, with 16-bit samples spread if they use a small part of their range; and warnings."""
+    used = levels_of_sides(images[:1], images[1:])
+    lines = [warning("RIL-705", line) for line in words(used)]
+    return [spread(i, of) for i, of in zip(images, used, strict=True)], lines

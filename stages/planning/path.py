@@ -67,7 +67,8 @@ class Route:
     ``cells`` (vertex, 2) of the lattice and ``xyz`` (vertex, 3) metres, z the mean height under a wheel, both empty
     where there is none; ``planner`` that gave it, ``ground`` one of :data:`GROUNDS`. ``span``: farthest and nearest row
     that are free somewhere. ``reason`` why there is no path, and ``blocking_row``, the first one that cannot be entered
-    by rows, None where there is a path; ``ended_by``: why a path goes no farther, None where there is none.
+    by rows, None where there is a path, or none was sought by rows; ``ended_by``: why a path goes no farther, None
+    where there is none.
     """
 
     cells: Ints
@@ -262,7 +263,7 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
     far, near = span = row_span(~ground.closed)
     length, target = math.ceil(2.0 * vehicle.half_length / ground.lattice.cell), ends[1]
     # On a short map ends that are a vehicle's length from its borders would leave out most of it.
-    slack, blocking = min(length, (near - far) // 4), near
+    slack, blocking = min(length, (near - far) // 4), None if params.planner == "grid8" else near
     for planner in ("rows", "grid8") if params.planner == "auto" else (params.planner,):
         rows, ahead = planner == "rows", length if stretch else None
         found = _by_rows(ground, ends, slack, params) if rows else _anywhere(ground, ends, slack, ahead)
@@ -272,12 +273,10 @@ def _route(ground: PathMaps, vehicle: Vehicle, ends: Cells, stretch: bool, param
                 return Route(cells, ground.xyz(cells), planner, below, span)
             blocking = top - 1 if rows else blocking
     reason = BY_ROWS if params.planner == "rows" else AHEAD if None in ends else JOINED
-    if blocking < far:
+    if blocking is not None and blocking < far:
         # Rows cross the map: the target lies aside of what they reach, or the map is shorter than the vehicle.
-        reason = AHEAD if target is None else JOINED
-    # In any direction no row closes the way.
-    row = blocking if blocking >= far and params.planner != "grid8" else None
-    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, row)
+        reason, blocking = AHEAD if target is None else JOINED, None
+    return Route(NO_CELLS, np.empty((0, 3)), planner, "middle", span, reason, blocking)
 
 
 def _by_rows(ground: PathMaps, ends: Cells, slack: int, params: PathParams) -> Iterator[tuple[str, Ints, int]]:

@@ -1,9 +1,7 @@
 """Merge of the elevation models of several basic pairs in one world frame (paper, section 4.5).
 
-All models lie on one lattice, so a cell of the result has one value a model. With sigma the elevation's standard
-deviation and r its residual, a model's weight is
-
-    w = 1 / (sigma^2 (1 + (r / r0)^2))        (sigma^-2 is (ds/dZ)^2 but for the disparity's error, equal for all)
+All models lie on one lattice, so a cell of the result has one value a model. A model's weight is 1 / sigma^2, sigma
+being the elevation's standard deviation.
 
 Where three or more models meet, one re-weighting about their weighted median takes out the one that contradicts.
 
@@ -79,18 +77,16 @@ def merge_cells(
 
     Parameters
     ----------
-    maps : (4, n, rows, cols) elevations, their standard deviations, residuals and grey values of n models, NaN
-        undefined, on the cells of ``strip``.
+    maps : (3, n, rows, cols) elevations, their standard deviations and grey values of n models, NaN undefined, on the
+        cells of ``strip``.
     layers : (n,) those models.
     errors : that the models share.
     worst : greatest standard deviation without the poses' part, m.
     """
-    z, sigma, residual, ortho = maps.astype(np.float64)
-    # A residual as large as the error of a good disparity halves a model's weight.
-    residual /= 0.1
+    z, sigma, ortho = maps.astype(np.float64)
     with np.errstate(divide="ignore", over="ignore"):
-        weight = 1.0 / (sigma * sigma * (1.0 + residual * residual))
-    known = np.isfinite(z) & (sigma > 0.0) & (residual >= 0.0) & (weight > 0.0) & np.isfinite(weight)
+        weight = 1.0 / (sigma * sigma)
+    known = np.isfinite(z) & (sigma > 0.0) & (weight > 0.0) & np.isfinite(weight)
     z, sigma, weight = (np.where(known, a, 0.0) for a in (z, sigma, weight))
     # Of two models that contradict each other none is the outlier.
     several = np.count_nonzero(known, axis=0) >= 3
@@ -269,13 +265,13 @@ def merge(layers: Sequence[ModelLayer], tile: Lattice, params: MergeParams, inve
 
 
 def _read(layers: Sequence[ModelLayer], strip: Lattice) -> Floats32:
-    """Read a strip of the models: arrays (4, n, rows, cols), see :func:`merge_cells`."""
-    maps = np.full((4, len(layers), *strip.shape), np.nan, dtype=np.float32)
+    """Read a strip of the models: arrays (3, n, rows, cols), see :func:`merge_cells`."""
+    maps = np.full((3, len(layers), *strip.shape), np.nan, dtype=np.float32)
     for k, layer in enumerate(layers):
         common = strip.intersection(layer.lattice)
         assert common is not None
         here, there = strip.window(common), layer.lattice.window(common)
-        for target, name in zip(maps, ("elevation", "elevation_std", "residual", "ortho"), strict=True):
+        for target, name in zip(maps, ("elevation", "elevation_std", "ortho"), strict=True):
             target[k][here] = layer.part(name, there)
     return maps
 

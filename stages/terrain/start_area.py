@@ -47,7 +47,6 @@ def pad(T_world_vehicle: RigidTransform, radius: float, cell: float) -> tuple[La
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame="world"),
         raster("elevation_std", "m", "standard deviation of the elevation", frame="world"),
-        raster("residual", "px", "none: not measured", frame="world"),
         raster("ortho", "grey", "none: not seen", frame="world"),
     ],
 )
@@ -69,7 +68,6 @@ def start_area_stage(
     arrays = {
         "elevation": elevation,
         "elevation_std": np.where(known, sigma, np.float32(np.nan)),
-        "residual": np.where(known, np.float32(0.0), np.float32(np.nan)),
         "ortho": np.full(elevation.shape, np.nan, np.float32),
     }
     return Bundle(arrays, {"lattice": lattice.to_dict(), "frame": "world", "pair": NO_PAIR})

@@ -89,6 +89,8 @@ def test_a_part_of_a_run_computes_what_it_needs_and_says_what_it_leaves_out(plac
     first, second = place.here(*words), place.here(*words)
     assert (first.status, second.status) == (0, 0), first.err + second.err
     assert re.fullmatch(r"left out, as --only trajectory.tum asks: \d+ known tasks \(.*locus.*\), .*", second.last)
+    planned = place.here("plan", *words[1:])
+    assert (planned.status, " 0 to do" in planned.out) == (0, True), planned.out
     run = tmp_path / "mockup-short" / "latest"
     whole = place.runs("mockup-short")[0]
     assert (run / "trajectory.tum").read_bytes() == (whole / "trajectory.tum").read_bytes()
@@ -187,18 +189,6 @@ def test_plan_of_what_is_there_finds_nothing_to_do(place: Place, words: list[str
     ran = re.search(r"computed 0, cached (\d+)", place.said[f"{'other' if words is OTHER else 'mockup'} again"].last)
     assert ran is not None
     assert first.last == f"{ran[1]} tasks known: {ran[1]} cached, 0 to do", "outputs are tasks too"
-
-
-@pytest.mark.parametrize("part", [["--until", "merge"], ["--only", "dem.tif", "--only", "path.gpkg"]])
-def test_plan_of_a_part_knows_its_tasks_alone(place: Place, part: list[str]) -> None:
-    whole, done = place.here("plan", *MOCKUP), place.here("plan", *MOCKUP, *part)
-    assert (done.status, done.err) == (0, "")
-    tasks = re.fullmatch(r"(\d+) tasks known: \1 cached, 0 to do", done.last)
-    assert tasks is not None, done.last
-    assert int(tasks[1]) < int(whole.last.split()[0])
-    anew = place.here("plan", *MOCKUP, *part, "--set", "hfvm.preset=fast")
-    assert "accuracy" not in anew.out
-    assert place.here("plan", *MOCKUP, "--until", "merges").status == 2
 
 
 @pytest.mark.parametrize(

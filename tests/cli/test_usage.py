@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from cyclopts import App
 from place import RILLE, Place
@@ -48,6 +50,8 @@ WRONG = {
         ("other --jobs -2", "RIL-540"),
         ("other --force no-such-stage", "RIL-035"),
         ("other --memory-limit lots", "RIL-553"),
+        ("other --until no-such-stage", "RIL-035"),
+        ("other --only no-such-file", "RIL-035"),
         ("no-such-sequence --runs elsewhere", "RIL-276"),  # taken, as by the run
     ],
     "graph": [
@@ -196,20 +200,19 @@ def test_a_reader_that_has_gone_is_no_traceback() -> None:
     assert (done.returncode, done.stderr) == (1, "")
 
 
-def test_names_with_any_letters_in_an_ascii_locale(tmp_path: Path) -> None:
-    (tmp_path / "größe").mkdir()
-    locale = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0"}
-    for words in (
-        ["datasets", "export", "mockup-short", "größe/ü", "--set", "mockup.frames=1"],
-        ["init", "größe/ü", "--output", "größe/ö.toml"],
-    ):
-        done = subprocess.run([str(RILLE), *words], check=True, cwd=tmp_path, env=locale, capture_output=True)
-    assert "rille check 'größe/ö.toml'" in done.stdout.decode()
-    assert 'root = "ü"' in (tmp_path / "größe" / "ö.toml").read_text("utf-8")
-
-
 def test_closed_streams_lead_nowhere() -> None:
     done = subprocess.run(f"'{RILLE}' datasets list >&-", check=False, shell=True, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     done = subprocess.run(f"'{RILLE}' datasets lst 2>&-", check=False, shell=True, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
+
+
+def test_names_are_utf8_in_the_locale_of_ascii(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
+    for side in ("left", "right"):
+        (tmp_path / "gr\u00fcn" / side).mkdir(parents=True)
+        (tmp_path / "gr\u00fcn" / side / "1.png").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    ascii_alone = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    words = [RILLE, "init", "gr\u00fcn", "-o", "\u00e4.toml"]
+    done = subprocess.run(words, cwd=tmp_path, env={**os.environ, **ascii_alone}, capture_output=True, timeout=120)
+    assert (done.returncode, "wrote        \u00e4.toml" in done.stdout.decode()) == (0, True), done.stderr

@@ -24,10 +24,9 @@ from rille.datasets.inspection.folder import inspect
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
-from rille.pipeline.engine.store.archive import pack
+from rille.pipeline.engine.store.arrays import codec
+from rille.pipeline.engine.store.artifact import artifact_path, pack
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import artifact_path
-from rille.pipeline.engine.store.zarr_group import codec
 from rille.pipeline.export.read_dem import read_raster
 from rille.pipeline.flow import config
 from rille.stages.core.errors import RilleError

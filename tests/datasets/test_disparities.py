@@ -145,40 +145,26 @@ def paths(folder, names):
     return found
 
 
-def of_images(folder, lefts, maps):
-    """The maps in a folder of left images, by their names; those of NumPy can be read."""
-    for path in paths(folder, " ".join(f"disp/{name}" for name in maps.split())):
-        path.write_bytes(npy(MAP) if path.suffix == ".npy" else b"")
-    return find("disp/*", folder, [Path(name) for name in lefts.split()], COLUMNS_ROWS, "disparity.left")
-
-
 @pytest.mark.parametrize(
     ("lefts", "maps", "wanted"),
     [
-        ("07.png 08.png 09.png", "09.npy 08.npy 07.npy 06.npy", "07 08 09"),
+        ("07.png 08.png 09.png", "09.pfm 08.pfm 07.pfm 06.pfm", "07 08 09"),
         ("left_7.png left_10.png", "left_10.npy left_7.npy", "left_7 left_10"),
         ("cam0_7.png cam0_10.png", "disp_0010.npy disp_0007.npy", "disp_0007 disp_0010"),
         ("00_10.png 01_10.png", "d_00_10.npy d_01_10.npy", "d_00_10 d_01_10"),  # the last number tells nothing apart
         ("a.png b.png", "2.npy 10.npy", "2 10"),
-        ("im0.png", "disp.npy", "disp"),
+        ("im0.png", "disp.pfm", "disp"),
     ],
 )
 def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
-    assert [path.stem for path in of_images(tmp_path, lefts, maps)] == wanted.split()
-
-
-@pytest.mark.parametrize("maps", ["07.npy 09.npy", "07.npy 09.npy 10.npy", "d7.npy d9.npy", "07.npy 08.pfm 09.npy"])
-def test_an_image_without_a_map_of_its_own_costs_its_own_pair(tmp_path, maps):
-    first, error, last = of_images(tmp_path, "07.png 08.png 09.png", maps)
-    assert [path.stem.strip("d0") for path in (first, last)] == ["7", "9"]
-    assert isinstance(error, InputError)
-    assert "08.p" in error.message
+    paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
+    found = find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
+    assert [path.stem for path in found.values()] == wanted.split()
 
 
 @pytest.mark.parametrize(
     ("lefts", "maps", "lacking"),
     [
-        ("07.png 08.png 09.png", "09.npy 10.npy 11.npy", "none for 07.png"),  # as many, but not of these images
         ("a.png b.png", "1.npy 2.npy 3.npy", ""),
         ("a.png b.png", "map.npy", ""),
         ("a.png", "", "none in /"),
@@ -188,12 +174,7 @@ def test_maps_that_do_not_fit_are_refused(tmp_path, lefts, maps, lacking):
     paths(tmp_path, " ".join(f"disp/{name}" for name in maps.split()))
     counts = f"{len(maps.split())} map", f"{len(lefts.split())} left image"
     with raises("RIL-901", "disparity.left", lacking, *counts):
-        of_images(tmp_path, lefts, maps)
-
-
-def test_maps_of_which_none_can_be_read_are_refused(tmp_path):
-    with raises("RIL-900", "07.pfm"):
-        of_images(tmp_path, "07.png 08.png", "07.pfm 08.tif")
+        find("disp/*", tmp_path, [Path(name) for name in lefts.split()], "disparity.left")
 
 
 # -- in a manifest -----------------------------------------------------------------------------------------------------
@@ -238,30 +219,24 @@ def test_true_maps_are_no_disparities_of_another_program(tmp_path, materialise):
         open_manifest(write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\nsigma = 1\n'), Digests())
 
 
-@pytest.mark.parametrize(
-    "damage", [Path.unlink, lambda p: p.write_bytes(b""), lambda p: p.write_bytes(p.read_bytes()[:-4])]
-)
-def test_a_pair_without_a_map_is_lost_and_without_a_true_one_not_judged(tmp_path, materialise, damage):
-    sequence(tmp_path)
-    for path in (tmp_path / "disp" / "01.npy", tmp_path / "sigma" / "02.npy"):
-        damage(path)
-    path = write_sequence(tmp_path, '[disparity]\nleft = "disp/*.npy"\nsigma = "sigma/*.npy"\n')
-    s = open_manifest(path, Digests())
-    assert set(s.lost) == {1, 2}
-    assert (materialise(s.disparity(0))["column_disparity"] == -10).all()
-    s = open_manifest(write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\n'), Digests())
-    assert not s.lost
-    assert s.truth_disparity(1) is None
-    assert (materialise(s.truth_disparity(2))["column_disparity"] == -30).all()
-    assert any("RIL-686" in line and "1 pair" in line for line in s.warnings)
-
-
 def test_lost_frames_need_no_map(tmp_path, materialise):
     sequence(tmp_path)
     (tmp_path / "left" / "01.png").unlink()
     (tmp_path / "disp" / "01.npy").unlink()
     s = open_manifest(tmp_path / "rover.rille.toml", Digests())
     assert (materialise(s.disparity(2))["column_disparity"] == -30).all()
+
+
+def test_a_frame_without_a_map_is_lost_or_not_judged(tmp_path):
+    sequence(tmp_path, 'left = "disp/*.npy"\nsigma = "sigma/*.npy"')
+    (tmp_path / "disp" / "02.npy").rename(tmp_path / "disp" / "03.npy")  # as many, but not of these images
+    (tmp_path / "sigma" / "00.npy").unlink()
+    s = open_manifest(tmp_path / "rover.rille.toml", Digests())
+    assert s.lost == {k: f"the map of 0{k}.png (disparity) is missing" for k in (0, 2)}
+    s = open_manifest(write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\n'), Digests())
+    assert not s.lost
+    assert [s.truth_disparity(k) is None for k in range(3)] == [False, False, True]
+    assert any("2 of 3 pairs" in note for note in s.notes)
 
 
 def test_a_map_that_changed_since_is_refused(tmp_path, materialise):

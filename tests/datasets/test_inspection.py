@@ -60,6 +60,7 @@ CAMERAS_5_6 = "left/*_Camera_5.png", "right/*_Camera_6.png"
 CAM_3_4 = "A/cam3/rgb/*.png", "A/cam4/rgb/*.png"
 LEFT_RIGHT = "*/left.png", "*/right.png"
 CAMERA_0_2 = "camera_00/im*.png", "camera_02/im*.png"
+CAMERA_0_2_OF_SCENES = "*/camera_00/im0.png", "*/camera_02/im0.png"
 LCAM = "image_lcam/*.png", "image_rcam/*.png"
 
 
@@ -90,6 +91,7 @@ LCAM = "image_lcam/*.png", "image_rcam/*.png"
         ([f"A/cam{c}/{what}/{k}.png" for c in (3, 4) for what in ("rgb", "depth") for k in (1, 2, 3)], *CAM_3_4, 3),
         ([f"{s}/im{k}.png" for s in ("aloe", "cones", "teddy") for k in (0, 1)], "aloe/im0.png", "aloe/im1.png", 1),
         ([f"run{k}/cam_{c}.png" for k in (1, 2) for c in (3, 4)], "*/cam_3.png", "*/cam_4.png", 2),
+        ([f"{s}/camera_{c}/im0.png" for s in ("a_b", "c") for c in ("00", "02")], *CAMERA_0_2_OF_SCENES, 2),
         ([f"camera_{c}/im0.png" for c in ("00", "02")], "camera_00/im0.png", "camera_02/im0.png", 1),
         *([[f"camera_{c}/im{k}.png" for c in ("00", "02") for k in range(n)], *CAMERA_0_2, n] for n in (2, 3, 5)),
         ([f"{c}/im{k}.png" for c in ("im0", "im1") for k in range(3)], "im0/im*.png", "im1/im*.png", 3),
@@ -285,18 +287,6 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
 def test_dead_reckoning_is_no_truth(tmp_path, name, kind):
     write_lines(tmp_path / name, ["# time x y z qx qy qz qw", *(f"{k} {k} 0 0 0 0 0.6 0.8" for k in range(3))])
     assert table_kind(tmp_path / name, 2) == kind
-    for rows in (["{} 1 0 0 0 0.6 0 0.8"], ["1 0 0 {} 0 1 0 0 0 0 1 0"]):
-        write_lines(tmp_path / name, [row.format(k) for row in rows for k in range(3)])
-        assert table_kind(tmp_path / name, 3) == kind, "without names of columns, too"
-
-
-@pytest.mark.parametrize(
-    "place", ["48\N{DEGREE SIGN} 6.000000' N,11\N{DEGREE SIGN} 30.0' E", "4806.0,1130.0", "48:06:00,11:30:00"]
-)
-def test_degrees_and_minutes_are_told_with_what_to_write_instead(tmp_path, place):
-    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude,altitude", *(f"{k},{place},500" for k in range(3))])
-    with raises("RIL-805", "decimal degrees (neither minutes"):
-        table_kind(tmp_path / "gnss.csv", 3)
 
 
 @pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
@@ -376,18 +366,6 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration.sizes == ((960, 600), (960, 600))
 
 
-def test_calibrations_numbered_as_the_cameras_are_a_pair(tmp_path):
-    write_images(tmp_path, [f"cam{side}/{k}.png" for side in (0, 1) for k in range(3)])
-    for k in (0, 1):
-        text = f"Pinhole 50 50 31 23 0.0\n{SIZE[0]} {SIZE[1]}\ncrop\n{SIZE[0]} {SIZE[1]}\n"
-        (tmp_path / f"undistorted_calib_{k}.txt").write_text(text)
-    (tmp_path / "undistorted_calib_stereo.txt").write_text("1 0 0 -0.3\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    found = inspect(tmp_path).calibration
-    assert found is not None
-    assert found.files == ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
-    assert found.baseline == pytest.approx(0.3)
-
-
 def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path):
     names = ["1", "2"]
     write_images(tmp_path, [*both("depth_{side}/{name}.png", names), *both("{side}/{name}.png", names)])
@@ -397,26 +375,6 @@ def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path)
     told = " ".join(found.unread)
     assert "4 images (depth_left/1.png ...): computed" in told
     assert "left/3.jpg" in told
-
-
-@pytest.mark.parametrize(
-    ("template", "sides", "frames", "command"),
-    [
-        ("{scene}/{side}{name}.png", ("im0_", "im1_"), "12", "rille init {folder}/bridge"),
-        ("{scene}/im{side}.png", "01", "1", "rille init {folder}/bridge"),  # ETH3D
-        ("{scene}/camera_{side}/im{name}.png", ("00", "02"), "012", "rille init {folder}/bridge"),  # Booster
-        ("{side}-half/{scene}/{name}.png", ("left", "right"), "123", "images.left and images.right"),  # DrivingStereo
-    ],
-)
-def test_of_several_scenes_one_is_taken_and_a_command_opens_another(tmp_path, template, sides, frames, command):
-    every = [(scene, side, name) for scene in ("bridge", "cellar", "alley") for side in sides for name in frames]
-    write_images(tmp_path, [template.format(scene=scene, side=side, name=name) for scene, side, name in every])
-    found = inspect(tmp_path)
-    assert (found.views.pairs, found.views.trouble) == (len(frames), "")
-    assert "alley" in found.views.left
-    assert any("2 other sets (" in line and command.format(folder=tmp_path) in line for line in found.unread), (
-        found.unread
-    )
 
 
 def test_places_in_images_become_a_table(tmp_path):
@@ -430,12 +388,34 @@ def test_places_in_images_become_a_table(tmp_path):
     assert any("EXIF of 2 of 3 left images" in line and "exiftool" in line for line in inspect(tmp_path).unread)
 
 
+def test_kinds_of_images_in_turns_are_one_set(tmp_path):
+    write_images(tmp_path, both("{side}/{name}.png", ["1", "3", "5"]) + both("{side}/{name}.jpg", ["2", "4"]))
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs, views.others) == ("left/*", "right/*", 5, ())
+    write_images(tmp_path, both("{side}/{name}.jpg", ["1", "3", "5"]))  # each png once more, as a jpg
+    assert inspect(tmp_path).views.pairs == 5
+
+
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
     write_images(tmp_path, days)
     found = inspect(tmp_path)
     assert (found.views.left, found.views.right, found.views.pairs) == ("day1_left_*.png", "day1_right_*.png", 3)
-    assert any("(day2_left_*.png and its right images)" in line for line in found.unread)
+    assert any(line.startswith("day2_left_*.png and its right images") for line in found.unread)
+
+
+def test_scenes_beside_each_other_are_named_with_the_command_that_takes_one(tmp_path):
+    write_images(tmp_path, [f"{s}/im{k}.png" for s in ("aloe", "teddy bear") for k in (0, 1)])
+    assert f"`rille init '{tmp_path}/teddy bear'` would take" in " ".join(inspect(tmp_path).unread)
+    write_images(tmp_path / "two", [f"{s}/camera_0{c}/im0.png" for s in ("art", "dolls") for c in (0, 2)])
+    views = inspect(tmp_path / "two").views
+    assert (views.pairs, f"`rille init {tmp_path}/two/art`" in views.lines[-1]) == (2, True)
+
+
+def test_images_in_turn_are_refused_with_the_patterns_of_a_manifest(tmp_path):
+    write_images(tmp_path, [f"{k:02d}.png" for k in range(6)])
+    with raises("RIL-194", "*[02468].png", "*[13579].png"):
+        inspect(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["my.rille.toml", "my.toml"])

@@ -180,8 +180,8 @@ def _empty(f):
     [
         breaks(("right missing", _drop_right, ("RIL-259", "000001.png"))),
         breaks(("left missing", _drop_left, ("RIL-259", "image_r/000001.png"))),
-        breaks(("pose count", _fewer_poses, ("RIL-230", "or rename {}/poses.txt: the folder opens without it"))),
-        breaks(("time count", _times, ("RIL-229", "or rename {}/times.txt"))),
+        breaks(("pose count", _fewer_poses, ("RIL-230", "poses.txt"))),
+        breaks(("time count", _times, ("RIL-229", "times.txt"))),
         breaks(("no calibration", _no_calib, ("RIL-278", "calib.txt"))),
         breaks(("one camera", _one_row, ("RIL-100", "calib.txt"))),
         breaks(("short row", _short_row, ("RIL-100", "calib.txt"))),
@@ -193,7 +193,7 @@ def _empty(f):
 )
 def test_what_is_wrong_is_one_line_with_a_remedy(folder, spoil, expected):
     spoil(folder)
-    with raises(*(words.format(folder) for words in expected)) as caught:
+    with raises(*expected) as caught:
         open_sequence(str(folder))
     assert "\n" not in str(caught.value)
     assert caught.value.remedy
@@ -277,6 +277,16 @@ def test_real_street(data_dir, materialise):
     image = materialise(s.image(50, "left"))["image"]
     assert image.shape == (370, 1226)
     assert image.dtype == np.uint8
+
+
+@pytest.mark.parametrize(("name", "code"), [("poses.txt", "RIL-230"), ("times.txt", "RIL-229")])
+def test_a_folder_opens_without_a_table_of_another_rate(folder, name, code):
+    rows = {"poses.txt": (folder / "poses.txt").read_text().splitlines()[:2], "times.txt": ["0", "0.1"]}
+    (folder / name).write_text("\n".join(rows[name]))
+    with raises(code, f"rename {folder / name}: the folder opens without it"):
+        open_sequence(str(folder))
+    (folder / name).unlink()
+    assert open_sequence(str(folder)).frames == 3
 
 
 def test_complaints_name_the_line_of_the_file(folder):

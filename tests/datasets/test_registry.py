@@ -10,7 +10,7 @@ from raising import raises
 from rille.datasets import registry
 from rille.datasets.registry import MANIFESTS, catalogue, open_sequence
 from rille.pipeline.flow import config as configuration
-from rille.pipeline.runs.options import Work
+from rille.pipeline.runs.options import Options
 from rille.pipeline.runs.session import settings_of_run
 
 
@@ -275,5 +275,5 @@ def test_another_warning_about_the_place_of_the_baseline_is_none_about_the_basel
     path = write_sequence(
         tmp_path / folder, cameras=cameras, rig="[rig]\nunit = 1.0\nT_right_left = [[1,0,0,-7],[0,1,0,0],[0,0,1,0]]\n"
     )
-    lines = settings_of_run(str(path), Work(), warn=lambda _: None).sequence.warnings
+    lines = settings_of_run(str(path), Options(), warn=lambda _: None).sequence.warnings
     assert {line[:7] for line in lines} == {"RIL-689", "RIL-641"}

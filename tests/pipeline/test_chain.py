@@ -21,9 +21,9 @@ import xarray
 from raising import raises
 
 from rille.pipeline.engine.events import read
+from rille.pipeline.engine.store.artifact import reference
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.engine.store.manifest import reference
 from rille.pipeline.report import gallery
 from rille.pipeline.report.canvas import FIGURE, Figure
 from rille.pipeline.report.delivery import lacking

@@ -20,7 +20,7 @@ from raising import raises
 from terrain_runs import finished
 
 from rille.pipeline.cli import main
-from rille.pipeline.engine.runtime.hints import read_hint
+from rille.pipeline.engine.runtime.atomic import read_hint
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export import read_dem
 from rille.pipeline.export.output import unpack

@@ -45,7 +45,7 @@ def grown(graph: Graph, failing: str = "") -> Graph:
     """All tasks of a dataflow, none of them run; those of a stage that fails have no results, nor what reads them."""
     waiting, legs = graph.waiting, 0
     while waiting:
-        handles, grow, holes = waiting.pop(0)
+        handles, grow = waiting.pop(0)
         facts: list[SimpleNamespace | None] = []
         for handle in graph.nodes:
             if handle.stage == failing or any(up.status == "failed" for up in handle.upstream()):
@@ -61,7 +61,7 @@ def grown(graph: Graph, failing: str = "") -> Graph:
                 meta, legs = LEG | {"verdict": "goal" if legs else "drive"} | meta, legs + 1
             handle.ref = SimpleNamespace(meta=meta)  # type: ignore[assignment]
             facts.append(handle.ref)  # type: ignore[arg-type]
-        if all(facts) or holes:
+        if grow is not None:
             grow(*facts)
     return graph
 

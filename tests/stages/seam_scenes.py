@@ -32,7 +32,6 @@ def dem(
     maps = {
         "elevation": z,
         "elevation_std": np.full(shape, SIGMA),
-        "residual": rng.uniform(0, 0.1, shape),
         "ortho": grey * rng.uniform(0.9, 1.1, shape),
     }
     meta = {"pair": pair, "lattice": lattice.to_dict(), "frame": "world"}

@@ -23,7 +23,6 @@ class ArrayLayer:
     lattice: Lattice
     elevation: np.ndarray
     elevation_std: np.ndarray
-    residual: np.ndarray
     ortho: np.ndarray
     gain: float = 1.0
     pose: Placed = EXACT

@@ -17,10 +17,9 @@ from torn.faults import Faults
 
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
-from rille.pipeline.engine.store import archive, maintenance
-from rille.pipeline.engine.store.base import NonDeterministicError, Store
-from rille.pipeline.engine.store.folder import StoreError
-from rille.pipeline.engine.store.manifest import artifact_path
+from rille.pipeline.engine.store import artifact, maintenance
+from rille.pipeline.engine.store.artifact import artifact_path
+from rille.pipeline.engine.store.base import NonDeterministicError, Store, StoreError
 from rille.stages.core.declare import NoParams
 
 WAYS = {
@@ -106,9 +105,9 @@ def damaged(calm, cache, kind, way, rng):
 def readable(path):
     """Whether an archive gives what a task reads that reads ``values``."""
     try:
-        with archive.opened(str(path)) as file:
+        with artifact.opened(str(path)) as file:
             file.member("values/c.0.0", file.size)
-    except archive.BrokenError:
+    except artifact.BrokenError:
         return False
     return True
 

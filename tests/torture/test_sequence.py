@@ -21,11 +21,10 @@ from test_damage import WAYS
 from torn import look
 
 from rille.pipeline.engine import events
+from rille.pipeline.engine.store.arrays import DamagedError, array_digests, output_digest
+from rille.pipeline.engine.store.artifact import artifact_path, reference
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.engine.store.manifest import artifact_path, reference
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 
 SMALL = (
     *("mockup.frames=5", "mockup.image_width=285", "mockup.image_height=260", "mockup.focal_length=300.0"),

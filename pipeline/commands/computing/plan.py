@@ -27,7 +27,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import dataflow
 from rille.pipeline.runs import part_of_run, run_files
 from rille.pipeline.runs.crate import resolved
-from rille.pipeline.runs.options import FLAG, Settings, Work, cache_folder
+from rille.pipeline.runs.options import FLAG, Options, Settings, cache_folder
 from rille.pipeline.runs.session import late, memory_limit, settings, settings_of_run
 from rille.stages.core.quantities import count, some
 
@@ -35,7 +35,7 @@ from rille.stages.core.quantities import count, some
 def plan(
     seq: str = "mockup",
     *,
-    options: Work = Work(),
+    options: Options = Options(),
     verbose: Annotated[bool, FLAG, Parameter(name=["--verbose", "-v"])] = False,
 ) -> None:
     """Show what `reconstruct` would compute and why, and what is cached; nothing is computed.
@@ -49,20 +49,22 @@ def plan(
     """
     seq, options, _ = resolved(seq, options)
     settled = settings_of_run(seq, options)
-    graph, store = Graph(cut=part_of_run.cut(options.until, options.only)), Store(cache_folder(options.cache))
-    config = settled.config
+    graph, config = Graph(cut=part_of_run.cut(options.until, options.only)), settled.config
+    store = Store(cache_folder(options.cache))
     products, drive = dataflow(graph, settled.sequence, config, settled.frames)
 
     def outputs() -> None:
-        if not graph.waiting:  # else some inputs are unknown, so they belong to the unknown tasks
-            view = RunView(**vars(settled), products=products, until=options.until, only=options.only)
-            run_files.plan(graph, late(view, drive))
+        view = late(RunView(**vars(settled), products=products, only=options.only), drive)
+        if graph.cut is not None:
+            run_files.lay_out(graph, view, {})
+        elif not graph.waiting:  # else some inputs are unknown, so they belong to the unknown tasks
+            run_files.plan(graph, view)
 
     graph.last = outputs
     result = run(graph, store, RunOptions(dry=True, force=options.force))
     result.check()
-    # Unknown tasks, and those of other parts, may read a parameter.
-    if not (result.unknown or options.part()) and (lost := unread.unread(settled.given, config, graph)):
+    # Unknown tasks may read a parameter, or those outside of the part that is made.
+    if not (result.unknown or graph.cut) and (lost := unread.unread(settled.given, config, graph)):
         raise unread.error(lost, config)
     budget = memory.budget(options.executor, memory_limit(options), options.jobs)
     planned = memory.Estimates().planned(graph)

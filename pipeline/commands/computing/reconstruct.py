@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rille.pipeline.commands import batch
+from rille.pipeline.commands import complaints
 from rille.pipeline.commands.results.runs import describe
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.runs import session
@@ -30,7 +30,7 @@ def reconstruct(seq: str = "mockup", *more: str, options: Options = Options()) -
     """
     if not more:
         return _perform(seq, options)[0]
-    code, ended = batch.each((seq, *more), lambda name: _perform(name, options), keep_going=options.keep_going)
+    code, ended = complaints.each((seq, *more), lambda name: _perform(name, options), keep_going=options.keep_going)
     runs = describe(end for _, end in ended if isinstance(end, Path))
     print("\n".join([*runs, *(f"{sequence:44s} {end}" for sequence, end in ended if isinstance(end, str))]))
     return code

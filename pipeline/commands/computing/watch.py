@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rille.datasets.images.arrivals import SETTLE_SECONDS, Arrivals
+from rille.datasets.images.files import image_stage
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.registry import open_sequence
 from rille.datasets.text.names import shell_word
@@ -200,7 +201,7 @@ def _image(source: Source) -> Source:
     """
     while "image" in source.inputs:
         source = source.inputs["image"]
-    if source.module != "rille.datasets.images.files":
+    if source.module != image_stage.module:
         remedy = "give a folder or a manifest of image files"
         raise ConfigError("RIL-087", "the images of this sequence do not arrive as files", remedy=remedy)
     return source

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.export import read_dem
@@ -22,9 +20,9 @@ from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, warning
 from rille.stages.core.quantities import metres
 from rille.stages.evaluation import dem_changes
-from rille.stages.evaluation import dem_comparison as evaluation
+from rille.stages.evaluation.dem_comparison import assess
 from rille.stages.evaluation.place import register
-from rille.stages.geometry.geometry import from_above, rotation_log
+from rille.stages.geometry.geometry import from_above
 from rille.stages.terrain.relief.grid import Grid
 
 WORDS = {"rmse": "RMSE", "nmad": "NMAD", "p95": "95 %", "bias": "bias", "median": "median"}
@@ -78,7 +76,9 @@ def compare_dem(
     lines = [*_lines(figures)]
     rasters = {"difference": error.astype(np.float32)}
     if changes:
-        rasters["standard_deviation"], figures["changes"] = changed(one, other, error, cells)
+        sigmas = [None if dem.sigma is None else dem.grid.at(cells.centres(), dem.sigma) for dem in (one, other)]
+        deviation, figures["changes"] = dem_changes.listed(error, cells, sigmas)
+        rasters["standard_deviation"] = deviation.astype(np.float32)
         lines += _change_table(figures["changes"])
     print("\n".join(lines))
     write_json(facts, figures)
@@ -109,58 +109,29 @@ def moved(dem: DemFile, motion: Floats) -> DemFile:
 
 
 def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any], Floats, Grid]:
-    """Figures (JSON-able) of A against the reference B, errors, m, on the common cells (rows, cols), and B on them.
+    """Facts for the JSON file, errors, m, on the common cells (rows, cols), and B on them.
 
-    Raises
-    ------
-    InputError
-        There is no common known cell.
-    DegenerateError
-        The terrain does not determine the alignment.
+    Errors are those of :func:`rille.stages.evaluation.dem_comparison.assess`.
     """
-    on_a, on_b, how = evaluation.common(a.grid, b.grid)
+    cameras, unit = (
+        a.viewpoints if a.viewpoints is not None else b.viewpoints,
+        "m, from the nearest position of the left camera",
+    )
+    if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
+        cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
+    unit = "no camera is known: give the folder of a run for A or B" if cameras is None or not len(cameras) else unit
+    found, error, cells = assess(a.grid, b.grid, None if align == "none" else align, cameras)  # type: ignore[arg-type]
     missing_crs = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
-    figures: dict[str, Any] = {
+    bins = {"by_slope": ("degrees of B", found.pop("by_slope")), "by_range": (unit, found.pop("by_range"))}
+    figures = {
         "a": _about(a),
         "b": _about(b),
         "error": "A minus B, m",
-        "resampling": how,
         "warnings": [*missing_crs, *a.warnings, *b.warnings],
+        **found,
+        **{name: {"unit": words, "bins": each} for name, (words, each) in bins.items()},
     }
-    pose = None
-    if align != "none":
-        figures["before_alignment"] = evaluation.figures(evaluation.errors(on_a, on_b))
-        alignment = evaluation.align(on_a, on_b, align)  # type: ignore[arg-type]
-        figures["alignment"], pose = _alignment(alignment, align), alignment.pose
-    error = evaluation.errors(on_a, on_b, pose)
-    figures["figures"] = evaluation.figures(error)
-    if not np.isfinite(error).any():
-        text = "no cell is left that both know"
-        raise InputError("RIL-617", text, remedy="leave --align out, or compare other models")
-    figures["completeness"] = _completeness(error, on_b, a)
-    slope = np.degrees(np.arctan(np.hypot(*on_b.slopes())))
-    edges = np.array([0.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0])
-    figures["by_slope"] = {"unit": "degrees of B", "bins": evaluation.binned(error, slope, edges)}
-    figures["by_range"] = _by_range(error, on_b, a, b)
-    return figures, error, on_b
-
-
-def changed(a: DemFile, b: DemFile, error: Floats, grid: Grid) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Standard deviation of the ``error`` of :func:`measure` on a grid, and list (JSON-able) of the changes."""
-    sigma = [np.zeros(error.shape) if one.sigma is None else one.grid.at(grid.centres(), one.sigma) for one in (a, b)]
-    deviation = dem_changes.standard_deviation(error, np.hypot(*sigma), np.hypot(*grid.slopes()), grid.cell)
-    found = dem_changes.changes(error, deviation, grid)
-    total = {}
-    for way, sign in (("rose", 1), ("fell", -1)):
-        of = [one for one in found if sign * one.volume_m3 > 0]
-        sigma_m3 = math.hypot(*(one.sigma_m3 for one in of))
-        total[way] = {"volume_m3": sum(one.volume_m3 for one in of), "sigma_m3": sigma_m3}
-    how = (
-        f"patches of cells that differ one way by {dem_changes.BESIDE:g} standard deviations, one of them by "
-        f"{dem_changes.SURE:g}, their volume by {dem_changes.SURE_VOLUME:g} of its own; standard deviations of both "
-        f"models and of a shift by {dem_changes.SHIFT_CELLS:g} cells, scaled up where most differences spread more"
-    )
-    return deviation.astype(np.float32), {"total": total, "patches": [asdict(one) for one in found], "how": how}
+    return figures, error, cells
 
 
 def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
@@ -181,49 +152,6 @@ def _change_table(changes: Mapping[str, Any]) -> Iterator[str]:
 def _about(raster: DemFile) -> dict[str, Any]:
     rows, cols = raster.grid.values.shape
     return {"path": raster.name, "rows": rows, "cols": cols, "cell_m": raster.grid.cell, "crs": crs_name(raster.crs)}
-
-
-def _alignment(alignment: evaluation.Alignment, kind: str) -> dict[str, Any]:
-    names = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "about_z_deg")
-    start = alignment.pose.inverse().apply(alignment.centre)
-    values = [*(alignment.centre - start), *np.degrees(rotation_log(alignment.pose.rotation))]
-    sigma = [*alignment.sigma[:3], *np.degrees(alignment.sigma[3:])]
-    return {
-        "kind": kind,
-        "motion_of_a": {names[k]: float(values[k]) for k in evaluation.FREE[kind]},
-        "sigma": {names[k]: float(sigma[k]) for k in evaluation.FREE[kind]},
-        "centre_m": start.tolist(),
-        "how": "x_b = R (x_a - centre) + centre + t; least squares of the elevation differences, Tukey's biweight",
-        "iterations": alignment.rounds,
-        "points": alignment.points,
-    }
-
-
-def _completeness(error: Floats, on_b: Grid, a: DemFile) -> dict[str, Any]:
-    """Share of compared cells of B: of all, and of those whose centres lie in the outline of A."""
-    compared, known, index = int(np.isfinite(error).sum()), np.isfinite(on_b.values), a.grid.index(on_b.centres())
-    inside = ((index >= -0.5) & (index <= np.array(a.grid.values.shape) - 0.5)).all(axis=-1)
-    within = int((known & inside).sum())
-    return {
-        "of_b": min(compared / known.sum(), 1.0),
-        "of_b_within_a": min(compared / max(within, 1), 1.0),
-        "how": f"{compared} cells compared, of {int(known.sum())} that B knows, {within} of these "
-        "within the outline of A",
-    }
-
-
-def _by_range(error: Floats, target: Grid, a: DemFile, b: DemFile) -> dict[str, Any]:
-    """Errors by the horizontal distance from the nearest camera; no bins if no camera is known."""
-    cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
-    unit = "m, from the nearest position of the left camera"
-    if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
-        cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
-    if cameras is None or not len(cameras):
-        return {"unit": "no camera is known: give the folder of a run for A or B", "bins": []}
-    distance = np.asarray(cKDTree(cameras).query(target.centres())[0], np.float64)
-    far = float(np.nanmax(np.where(np.isfinite(error), distance, np.nan)))
-    # Bins are open at their upper end: 1e-9 more, so that the last one holds the farthest cell.
-    return {"unit": unit, "bins": evaluation.binned(error, distance, np.linspace(0.0, far * (1.0 + 1e-9), 9))}
 
 
 def _lines(figures: Mapping[str, Any]) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,36 +14,23 @@ from cyclopts.validators import Number
 from rasterio.crs import CRS
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.commands.results.run_terrain import Terrain
+from rille.pipeline.commands.results.run_terrain import RunTerrain
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.paths import write_path
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
-from rille.pipeline.export.read_dem import (
-    DemFile,
-    crs_name,
-    frames_of,
-    read_elevation,
-    read_ortho,
-    refuse_unlike_systems,
-)
+from rille.pipeline.export.read_dem import crs_name, frames_of, read_elevation, read_ortho, refuse_unlike_systems
 from rille.pipeline.export.writers import ENGINEERING_CRS, write_json, write_trajectory_tum
 from rille.pipeline.python import runs as opened
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import COMPLETE, HOLES, RUNS, CacheFolder, Output, Run, Runs, cache_folder, output_file
 from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import ConfigError, DegenerateError, InputError
-from rille.stages.evaluation.place import place
-from rille.stages.geometry.geometry import from_above, heading_of, rotation_exp, rotation_log
-from rille.stages.terrain.map_localization import MapLocalizationParams, Placement, SearchArea, fix
-from rille.stages.terrain.relief.grid import Grid
+from rille.stages.evaluation.joint_terrain import TURN_DEG, locate, numbers
+from rille.stages.terrain.map_localization import Placement, SearchArea
 
 MAP_CRS = ENGINEERING_CRS.replace("Rille world frame", "frame of a map")
 """CRS for coordinates of a map that states none."""
-
-TURN_DEG = 20.0
-"""Degrees to either side of a given heading that are searched."""
-NAMES = ("x_m", "y_m", "z_m", "about_x_deg", "about_y_deg", "yaw_deg")
 
 
 @Parameter(name="*")
@@ -84,16 +71,6 @@ class Area:
             raise ConfigError("RIL-847", text, remedy="write e.g. --near 612.5,88.0,30") from None
         turn = math.radians(TURN_DEG) if yaw else math.pi
         return SearchArea(x, y, math.radians(sum(yaw)), self.within or math.inf, turn)
-
-
-def numbers(placed: Placement) -> dict[str, tuple[float, float]]:
-    """Known numbers of a place by name, with standard deviations: position, tilts about the map's axes, yaw."""
-    R, sigma = placed.pose.rotation, np.sqrt(np.diag(placed.covariance))
-    heading = heading_of(placed.pose)
-    tilts = np.degrees(rotation_log(R @ rotation_exp([0.0, 0.0, -heading])))[:2]
-    values = *placed.pose.translation, *tilts, math.degrees(heading)
-    sigmas = *sigma[:3], *np.degrees(sigma[3:])
-    return {name: (float(v), float(s)) for name, v, s in zip(NAMES, values, sigmas, strict=True) if s < math.inf}
 
 
 def for_file(placed: Placement) -> dict[str, Any]:
@@ -168,7 +145,7 @@ def localize(
     if dem is None and ortho is None:
         raise ConfigError("RIL-844", "no map is given", remedy="name an elevation model, or --ortho IMAGE")
     folder, systems, model, image = lookup.find(run, runs), dict[str, str](), None, None
-    around, terrain = area.around(), Terrain.of(folder)
+    around, terrain = area.around(), RunTerrain.of(folder)
     if ortho is not None:
         image, systems[str(ortho)] = read_ortho(ortho)
     if dem is not None:
@@ -178,9 +155,13 @@ def localize(
     if terrain.place is not None:
         systems[f"run {terrain.name}"] = CRS.from_user_input(terrain.place.crs).to_wkt(version="WKT2_2019")
     refuse_unlike_systems(systems)
+    for line in () if model is None else model.warnings:
+        warn(line)
     found, why = None, ""
     try:
-        found = _found(terrain, model, image, around)
+        # Standard deviation, degrees, of a vertical by a sensor, and of one by the ground.
+        tilt = 0.5 if terrain.vertical == "attitude" else 5.0
+        found = locate(terrain, image, None if model is None else model.grid, around, tilt, warn)
         why = found.doubt
     except DegenerateError as error:
         why = f"{error.code}: {error}"
@@ -203,41 +184,6 @@ def localize(
         for line in for_manifest(found, crs):
             print(line)
     return HOLES if why else COMPLETE
-
-
-def _found(terrain: Terrain, model: DemFile | None, image: Grid | None, around: SearchArea | None) -> Placement:
-    """Place by the ortho images, if there is one; then by the elevations, if there are any.
-
-    Raises
-    ------
-    DegenerateError
-        They do not determine the place.
-    """
-    by_ortho = None
-    if image is not None:
-        if around is not None and around.distance < math.inf:
-            away = np.linalg.norm(image.centres() - [around.x, around.y], axis=-1)
-            near = away <= around.distance + terrain.lattice.radius
-            image = replace(image, values=np.where(near, image.values, np.nan))
-        try:
-            by_ortho = place(terrain.image, image)
-        except DegenerateError as error:
-            if model is None:
-                raise
-            warn(f"{error.code}: {error}; by the elevations alone")
-    if model is None:
-        assert by_ortho is not None
-        return by_ortho
-    for line in model.warnings:
-        warn(line)
-    if by_ortho is not None:
-        # Elevations and ortho images must agree on a place within ten cells of the map.
-        around = SearchArea(*from_above(by_ortho.pose), 10.0 * model.grid.cell, math.radians(TURN_DEG))
-    # Standard deviation, degrees, of a vertical by a sensor, and of one by the ground.
-    tilt = 0.5 if terrain.vertical == "attitude" else 5.0
-    params = MapLocalizationParams.model_validate({"sigma_tilt_deg": tilt})
-    found = fix(terrain.grid, model.grid, around, params)
-    return found if by_ortho is None else replace(found, figures={**found.figures, **by_ortho.figures})
 
 
 def _export(folder: Path, found: Placement, output: Path, crs: str, store: Store) -> Iterator[Path]:

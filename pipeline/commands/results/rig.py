@@ -1,19 +1,12 @@
-"""``rille rig``: one rig from the matches of several runs, for manifests to pin.
-
-Each run repairs its rig by its own images, so that rigs of pieces of one log differ a little. Here the matches of all
-runs together decide which parameters depart from the calibration, as those of all pairs do in a run. The value of each
-parameter is the mean of the runs' own estimates, weighted by their covariances.
-"""
+"""``rille rig``: one rig from the matches of several runs, for manifests to pin."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tomli_w
 
 from rille.datasets.text.reading import read_toml
@@ -23,32 +16,11 @@ from rille.pipeline.engine.store.base import Store
 from rille.pipeline.export.programs.run_artifacts import RunArtifacts
 from rille.pipeline.runs import lookup, options
 from rille.pipeline.runs.options import RUNS, CacheFolder, Output, Run, Runs
-from rille.stages.calibration.parameter_selection import Parameter, decide
-from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
+from rille.stages.calibration.joint_rig import Joint, disagreements, joint
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs
 from rille.stages.calibration.rig import RigParams
-from rille.stages.core.arrays import Floats
-from rille.stages.core.errors import InputError, warning
-from rille.stages.geometry.epipolar import NAMES, corrected
+from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import Rig
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Correction of a rig by the matches of one run: values and standard deviations (5,), radians."""
-
-    run: str
-    values: Floats
-    sigma: Floats
-
-
-@dataclass(frozen=True)
-class Joint:
-    """The rig of all runs, its parameters, their joint values (5,) in radians, and each run's own estimate."""
-
-    rig: Rig
-    parameters: tuple[Parameter, ...]
-    values: Floats
-    estimates: tuple[Estimate, ...]
 
 
 def rig(
@@ -95,67 +67,22 @@ def rig(
     print(f'\n[rig]\nfile = "{output.resolve()}"')
 
 
-def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: RigParams) -> Joint:
-    """The rig of several runs: the given one, corrected where the matches of all together contradict it.
-
-    Parameters
-    ----------
-    matches : of each run, by its name.
-
-    Raises
-    ------
-    InputError
-        A run has no pair with enough matches.
-    """
-    empty = next((name for name, pairs in matches.items() if not pairs), None)
-    if empty is not None:
-        text = f"run {empty} has no pair with {MIN_MATCHES} matches"
-        raise InputError("RIL-030", text, remedy="leave it out, or choose more frames")
-    decision = decide(given, [pair for pairs in matches.values() for pair in pairs], params)
-    observed = [p.observed for p in decision.parameters]
-    priors, estimates, freed = params.priors(given), [], np.flatnonzero(decision.free())
-    normal, pull = np.zeros((len(freed), len(freed))), np.zeros(len(freed))
-    for name, pairs in matches.items():
-        fit = adjust(given, pairs, observed, priors, rival=False)
-        values, covariance, _ = solution(fit, observed, priors, rival=False)
-        values, covariance = values[: len(NAMES)], covariance[: len(NAMES), : len(NAMES)]
-        estimates.append(Estimate(name, values, np.sqrt(np.diag(covariance))))
-        inverse = np.linalg.inv(covariance[np.ix_(freed, freed)])
-        normal, pull = normal + inverse, pull + inverse @ values[freed]
-    values = np.zeros(len(NAMES))
-    values[freed] = np.linalg.solve(normal, pull)
-    return Joint(corrected(given, values), decision.parameters, values, tuple(estimates))
-
-
-def disagreements(found: Joint, significance: float) -> Iterator[str]:
-    """Lines on estimates of runs that differ from the joint one by more than ``significance`` standard deviations."""
-    for k, parameter in enumerate(found.parameters):
-        centre = parameter.asked if not parameter.freed else found.values[k]
-        for one in found.estimates if parameter.observed else ():
-            away = abs(one.values[k] - centre) / one.sigma[k]
-            if away > significance:
-                turn = math.degrees(one.values[k] - centre)
-                text = f"{parameter.name.replace('_', ' ')} of run {one.run} is {turn:+.3f} degrees off the others"
-                yield warning("RIL-025", f"{text}, {away:.0f} standard deviations: did the rig move between them?")
-
-
 def _table(found: Joint) -> Iterator[str]:
     """Table of corrections, degrees, by parameter: of all runs together, and of each."""
     names = [one.run.partition("/")[0] for one in found.estimates]
     heads = names if len(set(names)) == len(names) else [one.run.rpartition("/")[2] for one in found.estimates]
     yield "  ".join([f"{'degrees':17s}", *(f"{head:>17.17s}" for head in ["all", *heads])])
     for k, p in enumerate(found.parameters):
-        value = found.values[k] if p.freed else p.asked
         # The estimate of a parameter that is not observed would be the prior.
         own = [(one.values[k], one.sigma[k]) for one in found.estimates if p.observed]
-        each = [(value, p.sigma), *own]
+        each = [(p.asked, p.sigma), *own]
         cells = "  ".join(f"{math.degrees(v):+8.3f} +- {math.degrees(s):.3f}" for v, s in each)
         yield f"{p.name.replace('_', ' '):17s}  {cells}  {'corrected' if p.freed else 'as given: ' + p.why}"
 
 
 def _toml(found: Joint) -> str:
     """The file's text: the rig, and how it was estimated."""
-    turned = dict(zip(NAMES, np.degrees(found.values).tolist(), strict=True))
+    turned = {p.name: math.degrees(p.value) for p in found.parameters}
     content = {"runs": [one.run for one in found.estimates], "corrected_by_degrees": turned}
     head = "# A rig for manifests: [rig] file = ... ; x_right = R x_left + t, metres, rows of [R | t].\n"
     return head + tomli_w.dumps(content | {"rig": found.rig.to_dict()})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,29 +11,21 @@ from rille.datasets.georeference import Georeference
 from rille.pipeline.export.read_dem import frames_of, georeference_in, no_ground
 from rille.pipeline.python.runs import Run
 from rille.pipeline.runs import lookup
-from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError
+from rille.stages.evaluation.joint_terrain import Terrain
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.pose_arrays import REFERENCE_PLANE
-from rille.stages.terrain.relief.grid import Grid
 
 
 @dataclass(frozen=True)
-class Terrain:
-    """Merged terrain of a run.
+class RunTerrain(Terrain):
+    """Merged terrain of a run; ``place`` of its world frame, if it has one; ``vertical``: source of its vertical."""
 
-    ``arrays`` (row, col) on ``lattice``: ``elevation``, its standard deviation ``elevation_std``, m, and grey values
-    ``ortho``. ``place`` of the world frame, if the run has one; ``vertical``: source of the world's vertical.
-    """
-
-    name: str
-    arrays: Mapping[str, Floats]
-    lattice: Lattice
     place: Georeference | None
     vertical: str
 
     @staticmethod
-    def of(folder: Path) -> Terrain:
+    def of(folder: Path) -> RunTerrain:
         """Terrain in the folder of a run.
 
         Raises
@@ -57,14 +48,4 @@ class Terrain:
         if not np.isfinite(arrays["elevation"]).any():
             text = f"the terrain of run {name} has no known cell"
             raise InputError("RIL-843", text, remedy="its report says what is missing")
-        return Terrain(name, arrays, lattice, place, vertical)
-
-    @property
-    def grid(self) -> Grid:
-        """The elevations in the world frame."""
-        return Grid.on(self.lattice, self.arrays["elevation"])
-
-    @property
-    def image(self) -> Grid:
-        """The ortho image in the world frame."""
-        return Grid.on(self.lattice, self.arrays["ortho"])
+        return RunTerrain(name, arrays, lattice, place, vertical)

@@ -11,8 +11,8 @@ from rille.pipeline.engine import provenance
 from rille.pipeline.engine.keys import digest
 from rille.pipeline.engine.memory import words
 from rille.pipeline.engine.plain import brief
+from rille.pipeline.engine.store.artifact import artifact_path
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.flow.config import build
 from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, CacheFolder, Run, Runs, cache_folder

@@ -5,63 +5,21 @@ The result is an OpenCV YAML file, which manifests take: ``[cameras] file = "rig
 
 from __future__ import annotations
 
-import glob
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rille.datasets.images import chessboard, pairing
-from rille.datasets.images.files import SUFFIXES, read_grey
-from rille.datasets.protocol import CAMERAS
+from rille.datasets.images.boards import Boards, find_boards, image_files
 from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.plain import warn
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
-from rille.stages.calibration.target import (
-    LEAST_VIEWS,
-    MODELS,
-    BoardView,
-    RigCalibration,
-    calibrate_rig,
-    refuse_one_place,
-)
-from rille.stages.core.errors import InputError, told, warning
-from rille.stages.geometry.geometry import Sizes
-
-Image = NDArray[Any]
-
-
-@dataclass
-class Boards:
-    """Boards in the images of two sizes: ``views``, and in ``left_out`` name and reason of unusable pairs."""
-
-    corners: tuple[int, int]
-    sizes: Sizes
-    views: list[BoardView] = field(default_factory=list)
-    left_out: list[tuple[str, str]] = field(default_factory=list)
-
-    def take(self, name: str, images: Sequence[Image]) -> str:
-        """Add the view of a pair of images; return why it is unusable, if it is."""
-        if tuple(image.shape[::-1] for image in images) != self.sizes:
-            most = " and ".join(f"{width} x {height}" for width, height in dict.fromkeys(self.sizes))
-            return f"its images are not {most} pixels as most are"
-        left, right = (chessboard.find_corners(image, self.corners) for image in images)
-        if left is None or right is None:
-            missing = [side for side, points in zip(CAMERAS, (left, right), strict=True) if points is None]
-            return f"no whole board in the {' nor in the '.join(missing)} image"
-        view = BoardView(name, left, chessboard.same_order(left, right, self.corners))
-        # Below 1 pixel the board has not moved: noise moves corners by tenths of a pixel, a hand by many pixels.
-        same = next((other.name for other in self.views if _distance(view, other) < 1.0), None)
-        if same is not None:
-            return f"the board stands as in view {same}"
-        self.views.append(view)
-        return ""
+from rille.stages.calibration.target import RigCalibration, calibrate_rig, doubts, refuse_clutter, refuse_one_place
+from rille.stages.core.errors import InputError
 
 
 def calibrate(
@@ -98,7 +56,7 @@ def calibrate(
         check_new(output, ", and is no rig of this command")
     given = None if corners is None else chessboard.parse_corners(corners)
     chessboard.board_points((3, 3), square)  # refuses a wrong unit before minutes of detection
-    pictures = _files(left, right)
+    pictures = image_files(left, right)
     try:
         pairs = pairing.pair_up(*pictures)
     except InputError as error:  # its remedy is for manifests
@@ -107,116 +65,15 @@ def calibrate(
     boards = find_boards(pairs, given)
     points = chessboard.board_points(boards.corners, square)
     rig = calibrate_rig(points, boards.views, boards.sizes, model, keep_bad=keep_bad)
-    _refuse_clutter(rig, boards)
+    refuse_clutter(rig, boards.views, boards.corners)
     refuse_one_place(rig)
     atomic.write(output, _yaml(rig, boards, square))
     origin, size = "given" if given else "found", " x ".join(map(str, boards.corners))
     print(f"board        {size} inner corners ({origin}), squares of {square:g} m")
     print("\n".join([*_views(rig, boards), "", *_parameters(rig), ""]))
-    for line in doubts(rig, boards, model):
+    for line in doubts(rig, boards.views, boards.sizes, model):
         warn(line)
     print(f'wrote        {output}\nnext         in the manifest of the sequence:\n\n[cameras]\nfile = "{output.name}"')
-
-
-def _files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
-    """Image files of both sides; one folder may serve both if the names tell the sides."""
-    lefts, rights = _images(left), _images(right)
-    if left == right:
-        sides = {path: (pairing.side_of(path.stem) or (0, -1))[1] for path in lefts}
-        lefts, rights = ([path for path in lefts if sides[path] == side] for side in (0, 1))
-        if not (lefts and rights):
-            text = f"the names in {left} do not tell left from right"
-            raise InputError("RIL-010", text, remedy="give two folders, or two globs in quotes")
-    return lefts, rights
-
-
-def _images(place: Path) -> list[Path]:
-    """Image files of a folder, a glob or a single path."""
-    # glob skips hidden files, which macOS adds to archives.
-    pattern = f"{glob.escape(str(place))}/*" if place.is_dir() else str(place.expanduser())
-    images = sorted(Path(path) for path in glob.glob(pattern) if path.lower().endswith(SUFFIXES))
-    if not images:
-        remedy = "give a folder, or a glob in quotes such as 'left*.jpg'"
-        raise InputError("RIL-011", f"{place} names no images", remedy=remedy)
-    return images
-
-
-def find_boards(pairs: Sequence[pairing.ImagePair], corners: tuple[int, int] | None) -> Boards:
-    """The board in all pairs; its size is detected if it is not given.
-
-    Raises
-    ------
-    InputError
-        An image cannot be read, or too few pairs show a board of one size.
-    """
-    whole = [p for p in pairs if not p.absent]
-    images = {p.name: [chessboard.eight_bit(read_grey(path)) for path in (p.left, p.right)] for p in whole}
-    sizes = {name: tuple(image.shape[::-1] for image in both) for name, both in images.items()}
-    # A few images may have another size by mistake; the others still calibrate.
-    usual: Any = Counter(sizes.values()).most_common(1)[0][0]
-    if corners is None:
-        corners = chessboard.find_size(image for name in images if sizes[name] == usual for image in images[name])
-    out = Boards(corners, usual)
-    alone = [(p.name, p.absent) for p in pairs if p.left.exists() != p.right.exists()]
-    out.left_out = alone + [(name, why) for name, both in images.items() if (why := out.take(name, both))]
-    if out.left_out and len(out.views) < LEAST_VIEWS:
-        of_use = f"{len(out.views)} of {len(images)} pairs, {LEAST_VIEWS} are the least"
-        text = f"the board of {corners[0]} x {corners[1]} inner corners is of use in {of_use}"
-        remedy = "move the board between pictures, all of it in view and in focus"
-        more = "inner corners are one fewer than squares, along each side"
-        raise InputError("RIL-961", f"{text} ({told(out.left_out, ': '.join)})", remedy=f"{remedy}; {more}")
-    return out
-
-
-def _distance(a: BoardView, b: BoardView) -> float:
-    """RMS distance of the corners of two views, pixels, of the image in which they differ more."""
-    return max(float(np.sqrt(((p - q) ** 2).sum(-1).mean())) for p, q in ((a.left, b.left), (a.right, b.right)))
-
-
-def _refuse_clutter(rig: RigCalibration, boards: Boards) -> None:
-    columns, rows = boards.corners
-    grids = [p.reshape(rows, columns, 2) for v in boards.views for p in (v.left, v.right)]
-    spacing = float(np.median([np.linalg.norm(np.diff(g, axis=1), axis=-1) for g in grids]))
-    # 0.1: residual over the spacing of the corners above which they are not those of a flat board, whose print errs by
-    # hundredths; at any resolution and distance.
-    if rig.rms > 0.1 * spacing:
-        text = f"the corners taken for a board of {columns} x {rows} miss by {rig.rms:.1f} px RMS"
-        doubt = f"{spacing:.0f} px apart: no flat board, or not the same moment left and right"
-        remedy = "give pictures of a chessboard, and its inner corners, e.g. --corners 9x6"
-        raise InputError("RIL-800", f"{text}, {doubt}", remedy=remedy)
-
-
-def cover(points: Sequence[NDArray[np.float64]], size: tuple[int, int]) -> float:
-    """Share of an image within the convex hull of all corners."""
-    hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
-    return float(cv2.contourArea(hull)) / (size[0] * size[1])
-
-
-def doubts(rig: RigCalibration, boards: Boards, model: str) -> Iterator[str]:
-    """Reasons to doubt the result, one line each with its figure."""
-    # 1.0 px: a chessboard on paper leaves less.
-    if rig.rms > 1.0:
-        text = f"corners miss by {rig.rms:.2f} px RMS: is the board flat, are the images paired rightly?"
-        yield warning("RIL-696", text)
-    used = [view for view, r in zip(boards.views, rig.residuals, strict=True) if r.used]
-    for side, size in zip(CAMERAS, boards.sizes, strict=True):
-        share = rig.sigma[f"{side} fx"] / rig.values[f"{side} fx"]
-        # 0.01: all depths have this relative error.
-        if share > 0.01:
-            text = f"{side} focal length is known to {100 * share:.1f} % only; take views with the board tilted"
-            yield warning("RIL-697", text)
-        seen = cover([getattr(view, side) for view in used], size)
-        # Beyond the corners, distortion is extrapolated.
-        if seen < 0.5:
-            text = f"the corners span {100 * seen:.0f} % of the {side} image; distortion beyond is a guess"
-            yield warning("RIL-698", text)
-        known = {name: (abs(rig.values[f"{side} {name}"]), rig.sigma[f"{side} {name}"]) for name in MODELS[model]}
-        vague = [k for k, (value, sigma) in known.items() if sigma > max(value, 0.1) and k not in ("p1", "p2")]
-        if vague:
-            # These views may determine a model with fewer terms.
-            fewer = "radtan" if model == "rational" else "radtan4"
-            text = f"{side} {', '.join(vague)} cannot be told from 0 with these views; try --model {fewer}"
-            yield warning("RIL-699", text)
 
 
 def _views(rig: RigCalibration, boards: Boards) -> Iterator[str]:

@@ -18,11 +18,10 @@ import numpy as np
 
 from rille.datasets.images.files import sound
 from rille.datasets.protocol import CAMERAS, Sequence
-from rille.pipeline.commands import batch
+from rille.pipeline.commands import complaints
 from rille.pipeline.engine.graph import Graph, Handle, Maybe, MissingError, Wait
 from rille.pipeline.engine.run import Result, RunOptions, run
-from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.folder import StoreError
+from rille.pipeline.engine.store.base import Store, StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name_graph
 from rille.pipeline.flow.reconstruction import vertical
@@ -32,9 +31,9 @@ from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.input_checks import Finding
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
 from rille.pipeline.runs.session import settings
+from rille.stages.core.declare import Bundle
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.epipolar import beyond_infinity, inverse_depth
-from rille.stages.imaging.image_quality import glance
 from rille.stages.odometry.frame_screening import unlike_sides
 
 Steps = Generator[Wait, Any, None]
@@ -52,7 +51,7 @@ def check(seq: str, *more: str, options: Settings = Settings()) -> int:
     """
     if not more:
         return _check(seq, options)
-    return batch.each((seq, *more), lambda name: (_check(name, options), ""), keep_going=True)[0]
+    return complaints.each((seq, *more), lambda name: (_check(name, options), ""), keep_going=True)[0]
 
 
 def _check(seq: str, options: Settings) -> int:
@@ -129,35 +128,37 @@ class Inspection:
             yield from self._times(whole)
 
     def _images(self) -> Steps:
-        """Open every image: sizes, repetitions, exposure, sharpness."""
-        looks: dict[str, dict[int, dict[str, Any]]] = {camera: {} for camera in CAMERAS}
-        sizes, errors = set(), list[RilleError]()
+        """Open every image: repetitions, exposure, sharpness."""
+        errors = list[RilleError]()
         images = {(frame, camera): self.make.raw_image(frame, camera) for frame in self.frames for camera in CAMERAS}
-        yield Maybe(list(images.values()))
-        for (frame, camera), handle in images.items():
+        seen = {frame: self.make.quality(frame) for frame in self.frames}
+        yield Maybe([*images.values(), *seen.values()])
+        for at, handle in images.items():
             try:
                 if handle.ref is None:
                     raise _cause(handle)
-                bundle = sound(self.store.open(handle.ref), handle.spec.hints.get("path", ""))
+                sound(Bundle({}, handle.ref.meta), handle.spec.hints.get("path", ""))
             except RilleError as error:
                 errors.append(error)
-                self.broken.add((frame, camera))
-                continue
-            image = np.asarray(bundle["image"])
-            sizes.add(f"{image.shape[1]} x {image.shape[0]} {image.dtype}")
-            looks[camera][frame] = glance(image, np.asarray(bundle["valid"]))
-            if looks[camera][frame]["deviation"] < self.make.config.frame_screening.uniform:
-                self.broken.add((frame, camera))
+                self.broken.add(at)
+        known: dict[int, Any] = {k: one.ref.meta for k, one in seen.items() if one.ref is not None}
+        looks = {c: {k: of[c] for k, of in known.items() if (k, c) not in self.broken} for c in CAMERAS}
+        uniform = self.make.config.frame_screening.uniform
+        self.broken |= {(k, camera) for camera, of in looks.items() for k in of if of[k]["deviation"] < uniform}
         # More are only counted.
         for refusal in errors[:3]:
             self.refused(refusal, "images")
-        whole = f"all {len(images)} open, {' and '.join(sorted(sizes))}"
-        text = f"{len(errors)} of {len(images)} images cannot be used" if errors else whole
+        text = f"{len(errors)} of {len(images)} images cannot be used" if errors else f"all {len(images)} open"
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
-        # Images of one grey value do not count as repeated.
-        several = {c: {k: one["digest"] for k, one in of.items() if one["deviation"]} for c, of in looks.items()}
+        # As the cameras took them: one image is two when the lenses of two cameras are taken out of it. Images of one
+        # grey value do not count as repeated.
+        several = {c: {k: self._pixels(images[k, c]) for k in of if of[k]["deviation"]} for c, of in looks.items()}
         self.say(*self._repeated(several))
         self.say(*judge.judge_looks(looks, self.sequence.frame_names, self.make.config.frame_screening))
+
+    def _pixels(self, image: Handle) -> str:
+        """Digest of the pixels of an image."""
+        return str(self.store.read_manifest(image.stage, image.key)["arrays"]["image"]["sha256"])
 
     def _repeated(self, digests: Mapping[str, Mapping[int, str]]) -> Generator[Finding, None, None]:
         names = self.sequence.frame_names
@@ -199,17 +200,17 @@ class Inspection:
         rho, _ = inverse_depth(rig, left, right - left)
         given, rate = self.sequence.disparity is not None, disparity.meta["match_rate"]
         self.say(judge.judge_matching(rate, 1.0 / rho[rho > 0], rig.baseline, given=given))
-        if len(left) and not exchanged:
-            beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
-            self.say(judge.judge_sides(float(beyond.mean())))
         self.say(None if exchanged else judge.judge_epipolar(oriented.meta))
         self.say(judge.judge_repetition(oriented.meta["repeated"]))
         fitted, known = self.make.rig([pair])
         level = self.make.level(pair, vertical(self.make, pair), known)
         yield Maybe([level])
-        if fitted.ref is None and not exchanged:
+        if not exchanged and fitted.ref is None:  # as when matches lie beyond infinity
             self.refused(_cause(fitted), "rig")
-        elif fitted.ref is not None and "misread" in fitted.ref.meta:
+        elif not exchanged and len(left):
+            beyond = beyond_infinity(rig, left, right) > 1.0  # px, which noise makes
+            self.say(judge.judge_sides(float(beyond.mean())))
+        if fitted.ref is not None and "misread" in fitted.ref.meta:
             self.say(judge.judge("distortion", fitted.ref.meta["misread"], {"misread": 1}))
         self.say(*([judge.judge_ground(level.ref.meta)] if level.ref else []))
 

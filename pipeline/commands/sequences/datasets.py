@@ -10,10 +10,9 @@ from rille.datasets import registry
 from rille.datasets.export import export
 from rille.datasets.protocol import Source
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.spec import Spec
+from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import Ref
-from rille.pipeline.engine.task import ensure
+from rille.pipeline.engine.task import Spec, ensure
 from rille.pipeline.export.writers import check_folder
 from rille.pipeline.flow import config
 from rille.pipeline.runs.options import Assignments, CacheFolder, cache_folder

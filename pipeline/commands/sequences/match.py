@@ -14,9 +14,10 @@ from rille.datasets.images.files import read_grey, refuse_swapped
 from rille.pipeline.engine.plain import raw, warn
 from rille.pipeline.export.writers import Meaning, write_image
 from rille.pipeline.flow import config as configuration
-from rille.pipeline.runs.doubts import MIN_MATCHED_SHARE, doubts, levelled
 from rille.pipeline.runs.options import COMPLETE, FLAG, HOLES, Assignments, Output, check_output
+from rille.stages.calibration.doubt import MIN_MATCHED_SHARE, doubts
 from rille.stages.core.validity import Validity, matched
+from rille.stages.imaging.levels import levelled
 
 
 def match(

@@ -1,19 +1,26 @@
 """Files that appear whole or not at all: the one place that writes beside, flushes, and moves into place.
 
 A file that an interruption leaves behind is named ``.tmp-...``: nobody reads it, and ``rille cache gc`` removes it.
+Hints are JSON files that speed up or explain later runs; where one is missing or damaged, nothing else suffers.
 """
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter
 
 LEFTOVER = ".tmp-"
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -101,3 +108,17 @@ def named(path: Path) -> Iterator[None]:
 
 def _beside(path: Path) -> Path:
     return path.with_name(f"{LEFTOVER}{uuid.uuid4().hex[:16]}")
+
+
+def read_hint(path: Path, kind: TypeAdapter[T]) -> T | None:
+    """What was left in a file; None if there is none, or something else."""
+    # A pipe would block for ever, a device never ends.
+    with suppress(OSError, ValueError):
+        return None if not path.is_file() else kind.validate_json(path.read_bytes())
+    return None
+
+
+def write_hint(path: Path, value: Any) -> None:
+    """Leave a value for later runs; best effort."""
+    with suppress(OSError):
+        write(path, json.dumps(value))

@@ -6,7 +6,7 @@ processes that compile two signatures of one function at once may both take the 
 for it (locators, events), a kernel
 
 - is known by the digest of its module and of all own modules that this one reaches
-  (:mod:`rille.pipeline.engine.code_digest`), so that an edit compiles anew what it can change, and nothing else;
+  (:mod:`rille.pipeline.engine.keys`), so that an edit compiles anew what it can change, and nothing else;
 - is compiled by one process at a time: the others wait, and load it;
 - has its checksum in a file beside it, which is compared before numba loads anything;
 - lies in a folder of its function (:func:`~rille.pipeline.engine.runtime.private.private_folder`): loading executes it.
@@ -29,8 +29,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from rille.pipeline.engine.code_digest import OWN, code_digest, package_of
-from rille.pipeline.engine.runtime.hints import read_hint, write_hint
+from rille.pipeline.engine.keys import OWN, code_digest, package_of
+from rille.pipeline.engine.runtime.atomic import read_hint, write_hint
 from rille.pipeline.engine.runtime.private import private_folder
 
 LOCATORS = "NUMBA_CACHE_LOCATOR_CLASSES"

@@ -8,7 +8,7 @@ Files in the cache folder::
                                             of correctness
     roots/<digest>.json                     folders of runs that use the cache
 
-The file of an artifact (:mod:`rille.pipeline.engine.store.archive`) is its own commit: it is on the disk as a whole
+The file of an artifact (:mod:`rille.pipeline.engine.store.artifact`) is its own commit: it is on the disk as a whole
 before it gets its name, and gets it only if nobody has it (a link). Killed at any instant, a run leaves a whole
 artifact or none. If two runs commit one key, the second result is compared and dropped: another digest is a
 :class:`NonDeterministicError`. Checksums of what is read are compared at each reading, and all of them by
@@ -18,26 +18,74 @@ again.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import tempfile
 import time
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from rille.pipeline.engine.failures import CLOSED, FULL, remedy_of
 from rille.pipeline.engine.runtime import atomic
-from rille.pipeline.engine.store import archive, folder, manifest
-from rille.pipeline.engine.store.archive import BrokenError
-from rille.pipeline.engine.store.folder import StoreError
-from rille.pipeline.engine.store.lazy_arrays import LazyArrays
-from rille.pipeline.engine.store.manifest import Manifest, Ref, artifact_path
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
-from rille.pipeline.engine.store.zarr_group import encode
+from rille.pipeline.engine.store import artifact
+from rille.pipeline.engine.store.arrays import LazyArrays, array_digests, encode, output_digest
+from rille.pipeline.engine.store.artifact import Archive, BrokenError, Manifest, Ref, artifact_path
 from rille.stages.core.declare import Bundle, Stage
-from rille.stages.core.errors import RilleError
+from rille.stages.core.errors import ConfigError, RilleError
+
+
+class StoreError(RilleError):
+    """The cache cannot be read or written."""
+
+
+def locate(cache: Path | str) -> Path:
+    """Folder of a cache.
+
+    Raises
+    ------
+    ConfigError
+        It is a URL; the message does not repeat what may be a password.
+    """
+    if re.match(r"\w+:/", str(cache)):  # a Path has lost the second slash
+        text = f"a cache at {str(cache).partition(':')[0]}:// is not supported"
+        raise ConfigError("RIL-546", text, remedy="give --cache a folder; machines share one by NFS, say")
+    return Path(cache)
+
+
+@contextmanager
+def clear_errors(root: Path) -> Iterator[None]:
+    """Raise as a :class:`StoreError` where the disk below ``root`` is full, or refuses; other errors may be passing."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (*FULL, *CLOSED, errno.ENOTDIR):
+            raise
+        text = f"the cache {root} cannot be used ({os.strerror(error.errno)})"
+        raise StoreError("RIL-575", text, remedy=remedy_of(error.errno)) from error
+
+
+def files(root: Path, area: str) -> list[tuple[str, os.stat_result]]:
+    """All files below a folder in ``root``: their paths relative to ``root``, in order, and their status."""
+    listed = []
+    for folder, _, names in os.walk(root / area):
+        for path in (Path(folder, name) for name in names):
+            with suppress(OSError):  # gone meanwhile
+                listed.append((path.relative_to(root).as_posix(), path.lstat()))
+    return sorted(listed)
+
+
+def quarantine(path: Path, root: Path, name: str) -> Path:
+    """Move a file aside; its new path, whose name begins with ``name``."""
+    aside = root / "quarantine" / f"{name}-{uuid.uuid4().hex[:8]}"
+    aside.parent.mkdir(parents=True, exist_ok=True)
+    os.rename(path, aside)
+    return aside
 
 
 class NonDeterministicError(RilleError):
@@ -64,7 +112,7 @@ class Store:
     """
 
     def __init__(self, cache: Path | str) -> None:
-        self.root = folder.locate(cache).absolute()
+        self.root = locate(cache).absolute()
 
     def hints(self, sequence: str) -> Path:
         """Folder of what earlier runs of a sequence leave for explanations and plans."""
@@ -79,7 +127,7 @@ class Store:
         StoreError
             The folder cannot be made, is full or may not be written.
         """
-        with folder.clear_errors(self.root):
+        with clear_errors(self.root):
             (self.root / "artifacts").mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.root) as file:
                 file.write(b"\0" * 4096)  # an empty file fits on a full disk
@@ -99,7 +147,7 @@ class Store:
             if use and os.stat(path).st_mtime < time.time() - 3600.0:
                 os.utime(path)
         try:
-            return manifest.reference(self.read_manifest(stage, key))
+            return artifact.reference(self.read_manifest(stage, key))
         except FileNotFoundError:
             return None
         except BrokenError as error:
@@ -121,13 +169,13 @@ class Store:
         BrokenError, FileNotFoundError
             It is not readable; there is none.
         """
-        with folder.clear_errors(self.root):
-            return manifest.read_manifest(f"{self.root}/{artifact_path(stage, key)}", stage, key)
+        with clear_errors(self.root):
+            return artifact.read_manifest(f"{self.root}/{artifact_path(stage, key)}", stage, key)
 
     @contextmanager
-    def opened(self, stage: str, key: str) -> Iterator[archive.Archive]:
+    def opened(self, stage: str, key: str) -> Iterator[Archive]:
         """The file of an artifact, open for reading; errors as those of :meth:`read_manifest`."""
-        with folder.clear_errors(self.root), archive.opened(f"{self.root}/{artifact_path(stage, key)}") as file:
+        with clear_errors(self.root), artifact.opened(f"{self.root}/{artifact_path(stage, key)}") as file:
             yield file
 
     def open(self, ref: Ref) -> Bundle:
@@ -168,25 +216,25 @@ class Store:
             "meta": json.loads(json.dumps(bundle.meta)),
             "provenance": dict(provenance or {}),
         }
-        content = archive.pack({archive.MANIFEST: json.dumps(made, allow_nan=False).encode(), **members})
+        content = artifact.pack({artifact.MANIFEST: json.dumps(made, allow_nan=False).encode(), **members})
         path = artifact_path(stage.name, key)
         # Another process may publish, damage or remove the same artifact between any two of these steps.
         for _ in range(3):
-            with folder.clear_errors(self.root):
+            with clear_errors(self.root):
                 if atomic.create(self.root / path, content):
-                    return manifest.reference(made)
+                    return artifact.reference(made)
             there = self.lookup(stage.name, key)  # a damaged one is set aside
             if there is not None and there.digest == digest:
                 return there
             old = self.manifest(stage.name, key)
             if there is not None and old is not None:
-                raise not_deterministic(stage.name, label or key[:12], manifest.difference(made, old))
+                raise not_deterministic(stage.name, label or key[:12], artifact.difference(made, old))
         raise StoreError("RIL-573", f"cannot publish {path} in {self.root}", remedy="remove that file and run again")
 
     def set_aside(self, stage: str, key: str, reason: str) -> bool:
         """Move a damaged artifact out of the way; False: it stays, for the cache may be read-only."""
         try:
-            aside = folder.quarantine(self.root / artifact_path(stage, key), self.root, f"{stage}-{key[:16]}")
+            aside = quarantine(self.root / artifact_path(stage, key), self.root, f"{stage}-{key[:16]}")
         except OSError as error:
             return isinstance(error, FileNotFoundError)  # another run has set it aside
         with suppress(OSError):

@@ -1,19 +1,26 @@
-"""Looking after a store: verification of all artifacts, and clearing away what no kept run refers to."""
+"""Looking after a store: verification of all artifacts, and clearing away what no kept run refers to.
+
+Folders of runs that use a cache are noted in the cache, so that clearing up keeps their artifacts.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import platform
 import re
 import time
 from collections import defaultdict
 from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
 
+from rille.datasets.text.reading import read_text
 from rille.pipeline.engine.failures import CLOSED
-from rille.pipeline.engine.store.archive import BrokenError
-from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.folder import clear_errors, files
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.store.manifest import STAGE, reference
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
+from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store.arrays import DamagedError, array_digests, output_digest
+from rille.pipeline.engine.store.artifact import STAGE, BrokenError, reference
+from rille.pipeline.engine.store.base import GoneError, Store, StoreError, clear_errors, files
 
 GRACE = 24 * 3600.0
 """Seconds before what no run is known to use goes: no single task takes a day."""
@@ -57,6 +64,46 @@ def verify(store: Store) -> tuple[int, list[str]]:
             outcome = "set aside" if aside else "it stays, for the cache cannot be written"
             damages.append(f"{label} ({stage}): {error}; {outcome}")
     return sound, damages
+
+
+ROOTS = "roots"
+"""Folder of the cache with a note of each folder of runs that uses it."""
+
+
+def note_runs(store: Store, runs: Path) -> None:
+    """Note a folder of runs, once, if the cache can be written."""
+    folder = str(runs.resolve())
+    # By machine and folder, since users of a shared cache may be on several machines.
+    named = hashlib.sha256(f"{platform.node()}\0{folder}".encode()).hexdigest()[:16]
+    path = store.root / ROOTS / f"{named}.json"
+    with suppress(OSError):
+        if not path.exists():
+            atomic.write(path, json.dumps({"folder": folder, "host": platform.node()}))
+
+
+def noted_runs(store: Store, runs: Path) -> list[Path]:
+    """``runs`` and all noted folders, without those of this machine that are gone.
+
+    Raises
+    ------
+    StoreError
+        Runs of another machine cannot be read from here, so that their artifacts would count as unused; or a note
+        cannot be read.
+    """
+    seen = {runs.resolve()}
+    for path in (store.root / ROOTS).glob("*.json"):
+        try:
+            noted = json.loads(read_text(path, "note"))
+            folder, host = Path(noted["folder"]), str(noted["host"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            remedy = "remove it, once you know that no run needs this cache"
+            raise StoreError("RIL-742", f"{path} cannot be read", remedy=remedy) from error
+        if folder.is_dir():
+            seen.add(folder)
+        elif host != platform.node():
+            remedy = f"clear up there, or remove {path} if they are gone"
+            raise StoreError("RIL-743", f"the runs in {folder} on {host} cannot be seen from here", remedy=remedy)
+    return sorted(seen)
 
 
 def gc(store: Store, keep: Collection[str], *, grace: float = GRACE, dry_run: bool = False) -> dict[str, list[int]]:

@@ -35,31 +35,15 @@ from rille.stages.odometry.resection.bundle_adjustment import (
 from rille.stages.odometry.resection.landmarks import triangulated
 from rille.stages.odometry.resection.pnp import bias_information
 
-PRIORS: Mapping[str, float] = {
-    "focal length": 1.0,
-    "principal point's column": 1.0,
-    "principal point's row": 1.0,
-    "radial distortion": 1.0,
-    "pitch": 0.1,
-    "roll": 0.1,
-    "baseline across": 0.1,
-    "baseline forward": 0.1,
-    "toe-in": 1.0,
-}
-"""Numbers whose errors are estimated: of both cameras over the focal length, and their coefficient k1; of the rig's
-correction (:mod:`rille.stages.geometry.epipolar`), rad; and its toe-in, rad. With each its standard deviation over that
-of the focal length: the rows of all pairs show the rig's angles far better (:mod:`rille.stages.calibration.rig`)."""
+NUMBERS = ("focal length", "principal point's column", "principal point's row", "radial distortion", "toe-in")
+"""What the errors are of: both cameras, over the focal length, and their coefficient k1; and the rig's toe-in, rad. The
+rows of all pairs show its other angles far better (:mod:`rille.stages.calibration.rig`)."""
 
 CORRECTED = 3
 """Number of these that are corrected: those of the camera without distortion."""
 
 STEP = 1e-4
 """Change of each number by which the tracks are differentiated."""
-
-
-def deviations(focal: float) -> Floats:
-    """Standard deviations (k,) of :data:`PRIORS`, by that of the focal length."""
-    return focal * np.array(list(PRIORS.values()))
 
 
 class SegmentCameras(NamedTuple):
@@ -106,15 +90,10 @@ def corrected_like(side: str, camera: Camera, rig: Rig, errors: Sequence[float] 
     return corrected(camera, [larger, *centre])
 
 
-def corrected_rig(
-    rig: Rig, errors: Sequence[float] | Floats, yaw: float, pitch: float = 0.0, others: Sequence[float] = (0.0,) * 3
-) -> Rig:
-    """Rig whose cameras are changed by the first of ``errors``, and whose angles by others, rad.
-
-    Where a pitch moves all disparities, as of cameras one above the other, pitch and yaw change places.
-    """
-    first = [yaw, pitch] if epipolar.standing(rig) else [pitch, yaw]
-    turned = epipolar.corrected(rig, np.array([*first, *others]))
+def corrected_rig(rig: Rig, errors: Sequence[float] | Floats, yaw: float) -> Rig:
+    """Rig whose cameras are changed by the first of ``errors``, and its yaw, rad; of cameras one above the other, the
+    pitch, which moves all disparities, takes the place of the yaw."""
+    turned = epipolar.corrected(rig, yaw * (np.array(epipolar.NAMES) == epipolar.angle_along(rig)))
     left, right = (corrected_like(side, getattr(rig, side), rig, errors) for side in ("left", "right"))
     return replace(turned, left=left, right=right)
 
@@ -141,8 +120,8 @@ def composed(before: Sequence[float] | Floats, correction: Sequence[float] | Flo
 def with_errors(tracks: SegmentTracks, cameras: SegmentCameras, errors: Floats) -> SegmentTracks:
     """Measurements as they would be if the calibration were changed by ``errors`` (k + 1,), the yaw last."""
     rig, T_local_key = cameras.rig, cameras.T_local_key
-    pitch, *others, toe_in, yaw = errors[CORRECTED + 1 :]
-    other = toed_in(corrected_rig(rig, errors, yaw, pitch, others), toe_in)
+    toe_in, yaw = errors[CORRECTED + 1 :]
+    other = toed_in(corrected_rig(rig, errors, yaw), toe_in)
 
     def undistorted_anew(pixels: Floats, side: str, given: Camera, ideal: Camera) -> Floats:
         if (lens := cameras.lenses.get(side)) is not None:
@@ -177,8 +156,8 @@ def turn_deg(state: SegmentState, T_local_key: RigidTransform) -> float:
 
 
 def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: SegmentCameras) -> IntrinsicsPart:
-    """Contribution of an adjusted segment to the errors of :data:`PRIORS`, its unknowns free, by the stated errors."""
-    tracks, normal, k = problem.tracks, problem.normal(state), len(PRIORS)
+    """Contribution of an adjusted segment to the errors of :data:`NUMBERS`, its unknowns free, by the stated errors."""
+    tracks, normal, k = problem.tracks, problem.normal(state), len(NUMBERS)
     *changed, turned = (with_errors(tracks, cameras, STEP * one) for one in np.eye(k + 1))
     steps = [replace(problem, tracks=one) for one in (*changed, read_late(tracks, cameras, STEP))]
     (p, n), m = normal.between.shape, len(steps)
@@ -220,11 +199,11 @@ def contribution(problem: SegmentAdjustment, state: SegmentState, cameras: Segme
 
 def _of_read_out(matrix: Floats, right: Floats, prior: float, bias: float) -> tuple[float, float]:
     """Information and pull of the last unknown, the time between the rows: poses and the bias before the errors of
-    :data:`PRIORS` are free, the bias without the ``prior`` of its own, for it is the yaw."""
-    k = len(PRIORS) + 1
+    :data:`NUMBERS` are free, the bias without the ``prior`` of its own, for it is the yaw."""
+    k = len(NUMBERS) + 1
     # The errors are those of a usual calibration, the bias one of 10 px.
     hold = np.zeros(len(right))
-    hold[-k - 1 : -1] = [0.01 - prior, *deviations(0.005) ** -2.0]
+    hold[-k - 1 : -1] = [0.01 - prior, *[0.005**-2.0] * (k - 1)]
     free, pull = matrix + np.diag(hold), right.copy()
     pull[-k - 1] += prior * bias
     answer = np.linalg.solve(free[:-1, :-1], free[:-1, -1])

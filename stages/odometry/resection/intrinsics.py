@@ -30,11 +30,10 @@ from rille.stages.geometry.geometry import Rig
 from rille.stages.numeric.robust import huber_weight, mad_sigma
 from rille.stages.odometry.resection.calibration_errors import (
     CORRECTED,
-    PRIORS,
+    NUMBERS,
     STEP,
     composed,
     corrected_rig,
-    deviations,
 )
 
 MIN_SEGMENTS, MIN_YAW_SEGMENTS = 3, 2
@@ -58,16 +57,15 @@ class IntrinsicsParams(Params):
     Attributes
     ----------
     prior : standard deviation, as calibrated, of the focal length and of the principal point over the focal length, of
-        the radial distortion (k1), and of the toe-in [rad]; a tenth of it is that of the rig's other angles [rad];
-        0.005 is usual for a calibration with a target.
+        the radial distortion (k1), and of the toe-in [rad]; 0.005 is usual for a calibration with a target.
     """
 
     prior: float = Field(0.005, gt=0)
 
     @property
     def sigma(self) -> Floats:
-        """Standard deviations (k,) of :data:`PRIORS`."""
-        return deviations(self.prior)
+        """Standard deviations (k,) of :data:`NUMBERS`."""
+        return np.full(len(NUMBERS), self.prior)
 
 
 class CommonErrors(NamedTuple):
@@ -83,7 +81,7 @@ class Shown(NamedTuple):
 
     Attributes
     ----------
-    information, pull : (s, k, k) and (s, k), on :data:`PRIORS`.
+    information, pull : (s, k, k) and (s, k), on :data:`NUMBERS`.
     yaw : (s, 3), on the rig's yaw, and by how much its pull changes with an error of the toe-in.
     read_out : (s, 2), on the time from the first to the last row.
     """
@@ -97,7 +95,7 @@ class Shown(NamedTuple):
 def shown_by(segments: Sequence[Bundle[ResectFacts]], sigma: Floats) -> Shown:
     """The parts of all segments; those that hardly turn count for the toe-in alone, whatever the others are by
     ``sigma`` (k,)."""
-    parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(PRIORS)
+    parts, k = [s.meta["intrinsics"] for s in segments if s.meta["intrinsics"]], len(NUMBERS)
     information = np.array([part["information"] for part in parts]).reshape(-1, k, k)
     pull = np.array([part["pull"] for part in parts]).reshape(-1, k)
     # 4.0: turn of a segment from which on it counts: errors that all tracks share hide what smaller ones show.
@@ -204,7 +202,7 @@ def contradiction(errors: Sequence[float], sigma: Floats, focal: float) -> str:
     wrong = [
         f"the {name} by some {scale * error:+.2g} +- {scale * one:.1g} {unit}"
         for name, error, one, (scale, unit) in zip(
-            PRIORS, errors, sigma, ((100.0, "%"), (focal, "px"), (focal, "px")), strict=False
+            NUMBERS, errors, sigma, ((100.0, "%"), (focal, "px"), (focal, "px")), strict=False
         )
         if abs(error) > MIN_ERROR
     ]
@@ -293,8 +291,7 @@ def intrinsics_stage(
     """
     shown = shown_by(segments, params.sigma)
     used = Rig.from_dict(rig.meta["rig"])
-    focal, upright = used.left.fx, epipolar.standing(used)
-    names = ["yaw" if upright and name == "pitch" else name for name in PRIORS]
+    focal = used.left.fx
     made = np.zeros(CORRECTED + 1) if before is None else np.array(before)
     believed = MIN_CHANGE if made[:CORRECTED].any() else MIN_ERROR
     common = common_errors(shown.information, shown.pull, params.sigma, believed)
@@ -318,11 +315,11 @@ def intrinsics_stage(
         repaired = epipolar.turned_along(Rig.from_dict(given), used)
         correction = np.array([*np.zeros(CORRECTED), repaired + turn])
     facts: IntrinsicsFacts = {
-        "errors": dict(zip(names, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
+        "errors": dict(zip(NUMBERS, np.column_stack([common.errors, sigma]).tolist(), strict=True)),
         # What is not corrected stays in the poses: their covariance has its square.
         "covariance": (common.covariance + np.outer(left, left)).tolist(),
         # These rest on the calibration as given.
-        "held": [name for name, share in zip(names, sigma / params.sigma, strict=True) if share > 0.7],
+        "held": [name for name, share in zip(NUMBERS, sigma / params.sigma, strict=True) if share > 0.7],
         "yaw": [float(yaw.errors[0]), math.sqrt(yaw.covariance[0, 0])],
         "correction": correction.tolist(),
         "corrected": composed(made, correction).tolist(),

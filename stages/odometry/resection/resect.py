@@ -33,7 +33,7 @@ from rille.stages.geometry.scale import right_pixels
 from rille.stages.numeric.least_squares import irls
 from rille.stages.numeric.robust import cauchy
 from rille.stages.odometry.resection.bundle_adjustment import PosedTracks, SegmentAdjustment, adjust, pose_errors
-from rille.stages.odometry.resection.calibration_errors import PRIORS, SegmentCameras, contribution, turn_deg
+from rille.stages.odometry.resection.calibration_errors import NUMBERS, SegmentCameras, contribution, turn_deg
 from rille.stages.odometry.resection.landmarks import SegmentPoints, landmarks_of, matches_at
 from rille.stages.odometry.resection.robust_pose import (
     MIN_LANDMARKS,
@@ -71,7 +71,7 @@ class SegmentPoses:
             np.full((frames, 3, 4), np.nan),
             np.full((frames, 6, 6), np.nan),
             np.full((frames, 6, SHARED_SOURCES), np.nan),
-            np.zeros((frames, 6, len(PRIORS))),
+            np.zeros((frames, 6, len(NUMBERS))),
             np.zeros((count, frames), np.uint8),
             points.landmarks.position.copy(),
             [],

@@ -56,10 +56,9 @@ def explain(
     return DegenerateError(
         "RIL-391",
         f"none of {cells} cells could be reconstructed from {count} valid disparities of {usable.size}: they "
-        f"contradict the calibration, or lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation, or the "
-        "cells are too coarse for what the cameras see",
-        remedy="look at the rig's residuals in the report; or raise locus.max_residual or locus.max_sigma, or lower "
-        "locus.cell_size",
+        f"lie outside of {z_range[0]:.4g} to {z_range[1]:.4g} m of elevation, or the cells are too coarse for what the "
+        "cameras see",
+        remedy="look at the rig's residuals in the report; or raise locus.max_sigma, or lower locus.cell_size",
     )
 
 

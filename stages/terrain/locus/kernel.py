@@ -12,8 +12,8 @@ across a depth jump between two pixels nothing was seen: the cell is occluded th
 
 **Which change, where there are several.** The search begins at the top of the cell's interval. If the point there is
 free, it goes down to the first change; if it is behind the surface, it first goes up to the nearest change above the
-start. A change *stands* if its residual, its slope and the jump of the disparities around it are within the limits;
-after one that does not, the search goes on, downwards from the start in the end. So the result is the highest change
+start. A change *stands* if its slope and the jump of the disparities around it are within the limits; after one that
+does not, the search goes on, downwards from the start in the end. So the result is the highest change
 that stands at or below the start, or the nearest one above it. A cell whose interval, handed down from its coarse
 neighbours, lies wholly on another surface may so miss one that a search of the whole range would find.
 """
@@ -48,15 +48,14 @@ class Observed(NamedTuple):
     """What is read at a pixel of the left image (rows, cols).
 
     ``disparity`` (rows, cols, 2) right minus left, column and row, pixels, NaN where it must not be used; ``std``
-    (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_residual`` and ``max_jump``
-    (in the bilinear cell) of a solution, pixels; ``axes`` (2, 2) where a column and a row of the left image lead in the
+    (rows, cols) its standard deviation, pixels; ``image`` (rows, cols) grey values; ``max_jump`` of the disparities in
+    the bilinear cell of a solution, pixels; ``axes`` (2, 2) where a column and a row of the left image lead in the
     right one, see :func:`rille.stages.geometry.scale.axes`.
     """
 
     disparity: Floats32
     std: Floats32
     image: Floats32
-    max_residual: float
     max_jump: float
     axes: Floats
 
@@ -64,13 +63,11 @@ class Observed(NamedTuple):
 class Dem(NamedTuple):
     """Elevation model on a lattice, arrays (rows, cols) float32, NaN undefined.
 
-    ``elevation`` and its standard deviation ``elevation_std`` in metres, ``residual`` the
-    mismatch at the solution in pixels, ``ortho`` the grey value of the left image.
+    ``elevation`` and its standard deviation ``elevation_std`` in metres, ``ortho`` the grey value of the left image.
     """
 
     elevation: Floats32
     elevation_std: Floats32
-    residual: Floats32
     ortho: Floats32
 
 
@@ -106,14 +103,13 @@ class PairLines(NamedTuple):
 
 
 class Mismatch(NamedTuple):
-    """Mismatch g at a point, times the length of e: ``s`` along the epipolar line, ``across`` it; ``power`` |e|^2,
-    pixels^2. NaN where disparity is undefined or the point outside an image. ``x``, ``y``: the point in the left image.
+    """Mismatch g . e at a point, ``s``, and ``power`` |e|^2, pixels^2. NaN where disparity is undefined or the point
+    outside an image. ``x``, ``y``: the point in the left image.
 
     The search needs the sign of s alone, so neither a root nor a division is spent on a step.
     """
 
     s: float
-    across: float
     power: float
     x: float
     y: float
@@ -142,11 +138,10 @@ class Bracket(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Elevation and its standard deviation, m, residual, px, and grey value; NaN: the change does not stand."""
+    """Elevation and its standard deviation, m, and grey value; NaN: the change does not stand."""
 
     elevation: float
     std: float
-    residual: float
     grey: float
 
 
@@ -158,7 +153,7 @@ def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
     """
     # Arrays are taken out of their tuples before the loops: each time costs an atomic count of references.
     xs, ys, low, high = cells.x, cells.y, cells.low, cells.high
-    elevation, std, residual, ortho = out.elevation, out.elevation_std, out.residual, out.ortho
+    elevation, std, ortho = out.elevation, out.elevation_std, out.ortho
     left, right, sizes, direction = cameras.left, cameras.right, cameras.sizes, cameras.epipole
     for r in range(len(ys)):
         for c in range(len(xs)):
@@ -167,7 +162,7 @@ def search(cells, z_range, cameras, seen, out):  # type: ignore[no-untyped-def]
             lines = PairLines(line_of(left, xs[c], ys[r]), line_of(right, xs[c], ys[r]))
             start = low[r, c], high[r, c]
             cell = solve_cell(lines, visible(lines, sizes, z_range), start, direction, seen)
-            elevation[r, c], std[r, c], residual[r, c], ortho[r, c] = cell
+            elevation[r, c], std[r, c], ortho[r, c] = cell
 
 
 @kernel
@@ -246,7 +241,7 @@ def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     if not (
         w >= MIN_DEPTH_M and w_right >= MIN_DEPTH_M and x >= 0.0 and y >= 0.0 and x < cols - 1.0 and y < rows - 1.0
     ):
-        return Mismatch(np.nan, np.nan, np.nan, np.nan, np.nan)
+        return Mismatch(np.nan, np.nan, np.nan, np.nan)
     c, r = np.uint32(x), np.uint32(y)  # unsigned: not counted from the end, so no check at each use
     fx, fy, d = x - c, y - r, disparity
     w00, w01, w10, w11 = (1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy
@@ -261,13 +256,13 @@ def mismatch(lines, z, epipole, disparity):  # type: ignore[no-untyped-def]
     power = ex * ex + ey * ey
     # At the epipole itself no direction is that of the line.
     s = gx * ex + gy * ey if power > 0.0 else np.nan
-    return Mismatch(s, gy * ex - gx * ey, power, x, y)
+    return Mismatch(s, power, x, y)
 
 
 @inlined
 def solve_cell(lines, span, start, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` of one cell on the visible ``span`` of Z, searched from the interval ``start``."""
-    solution = Solution(np.nan, np.nan, np.nan, np.nan)
+    solution = Solution(np.nan, np.nan, np.nan)
     if not span[1] > span[0]:
         return solution
     disparity = seen.disparity
@@ -319,12 +314,11 @@ def root(lines, bracket, epipole, disparity):  # type: ignore[no-untyped-def]
 @inlined
 def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     """:class:`Solution` in a bracket, ``dz`` high; NaN where it does not stand."""
-    nothing = Solution(np.nan, np.nan, np.nan, np.nan)
+    nothing = Solution(np.nan, np.nan, np.nan)
     disparity, image = seen.disparity, seen.image
     z, at = root(lines, bracket, epipole, disparity)
-    residual = math.sqrt((at.s * at.s + at.across * at.across) / at.power)
     c, r = np.uint32(at.x), np.uint32(at.y)
-    if not residual <= seen.max_residual or is_jump(disparity, seen, r, c):
+    if math.isnan(at.s) or is_jump(disparity, seen, r, c):
         return nothing
     # The lesser slope: beside a jump the other side is steep, and would make the elevation look certain.
     above, below = mismatch(lines, z + dz, epipole, disparity), mismatch(lines, z - dz, epipole, disparity)
@@ -337,7 +331,7 @@ def _judged(lines, bracket, dz, epipole, seen):  # type: ignore[no-untyped-def]
     lower = image[r + 1, c] * (1.0 - fx) + image[r + 1, c + 1] * fx
     # sigma_Z = sigma_d / |ds/dZ|
     std = seen.std[np.uint32(np.rint(at.y)), np.uint32(np.rint(at.x))] / slope
-    return Solution(z, std, residual, upper * (1.0 - fy) + lower * fy)
+    return Solution(z, std, upper * (1.0 - fy) + lower * fy)
 
 
 @inlined

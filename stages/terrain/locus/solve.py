@@ -31,9 +31,7 @@ class LocusParams(Params):
     max_sigma : largest standard deviation [m], by sigma_disparity; not set: one cell size, or the one that would suit
         the pair if that is greater and cell_size is not set; above a plane that is no ground ten times that of the
         median match.
-    max_std : largest standard deviation [m] of a cell, by the matcher's; not set: 1.4 max_sigma.
     sigma_disparity : standard deviation of a typical disparity [pixels].
-    max_residual : largest residual |p_l + d - p_r| of a solution [pixels].
     refine_steps : number of Gauss-Newton steps that refine the elevations by both images; 6 for matches of preset fast,
         3 for others; 0: none.
     both : also match from right to left and use both elevations; doubles the time of matching.
@@ -43,9 +41,7 @@ class LocusParams(Params):
     extent: tuple[float, float, float, float] | None = None
     max_range_cells: float = Field(6.0, gt=0)
     max_sigma: float | None = Field(None, gt=0)
-    max_std: float | None = Field(None, gt=0)
     sigma_disparity: float = Field(0.2, gt=0)
-    max_residual: float = Field(0.5, gt=0)
     refine_steps: int = Field(3, ge=0, le=20)
     both: bool = False
 
@@ -59,7 +55,7 @@ def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) 
     disparity[~matches.usable] = np.nan
     std = np.full(shape, params.sigma_disparity) if matches.std is None else matches.std
     grey, std = (np.ascontiguousarray(a, np.float32) for a in (image, std))
-    return Observed(disparity, std, grey, params.max_residual, MAX_JUMP_PX, axes(rig))
+    return Observed(disparity, std, grey, MAX_JUMP_PX, axes(rig))
 
 
 def cameras_of(rig: Rig, T_local_left: RigidTransform) -> PairCameras:
@@ -76,7 +72,7 @@ def solve(seen: Observed, cameras: PairCameras, lattice: Lattice, z_range: tuple
     """Every cell of a lattice, coarse to fine: a few coarse cells search the whole ``z_range``, m."""
 
     def searched(cells: Cells) -> Dem:
-        out = Dem(*np.full((4, *cells.low.shape), np.nan, np.float32))
+        out = Dem(*np.full((3, *cells.low.shape), np.nan, np.float32))
         search(cells, z_range, cameras, seen, out)
         return out
 
@@ -106,5 +102,4 @@ def join(a: Dem, b: Dem) -> Dem:
     z = np.where(both, zb + share * (za - zb), np.where(only_a, za, zb))
     # Errors of cells matched one way alone are two to three times as large.
     std = np.where(both, np.sqrt(sa * sb + (za - zb) ** 2), 2.0 * np.where(only_a, sa, sb))
-    residual = np.where(only_a, a.residual, b.residual)
-    return Dem(z.astype(np.float32), std.astype(np.float32), residual, a.ortho)
+    return Dem(z.astype(np.float32), std.astype(np.float32), a.ortho)

@@ -44,7 +44,7 @@ from rille.stages.terrain.locus.uncertainty import NEAR_SIDE_CELLS, standard_dev
 from rille.stages.terrain.locus.views import SurfaceViews, View, facing
 from rille.stages.terrain.matches import Matches
 
-NO_LIMIT = {"max_sigma": None, "max_std": None}
+NO_LIMIT = {"max_sigma": None}
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,8 @@ def reconstruct(
     Returns
     -------
     Dem
-        A cell is undefined where a camera does not see it, where the disparity around it was not measured, jumps or
-        contradicts the calibration, or where its standard deviation is beyond ``max_std`` (``max_sigma`` where the
-        matches have none).
+        A cell is undefined where a camera does not see it, where the disparity around it was not measured or jumps, or
+        where its standard deviation is beyond :func:`greatest_std`.
 
     Raises
     ------
@@ -138,8 +137,6 @@ def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams
 
 def greatest_std(params: LocusParams, measured: bool) -> float | None:
     """Standard deviation of elevation, m, up to which a cell is accepted; None: any."""
-    if measured and params.max_std is not None:
-        return params.max_std
     if params.max_sigma is None:
         return None
     # 1.4: a cell's own standard deviation scatters about the typical one.
@@ -187,7 +184,7 @@ def world_lattice(elevation: Floats32, lattice: Lattice, T_world_local: RigidTra
         raise DegenerateError(
             "RIL-384",
             "the local elevation model is empty",
-            remedy="look at the disparity's validity and at locus.max_residual",
+            remedy="look at the disparity's validity and at locus.max_sigma",
         )
     points = T_world_local.apply(np.column_stack([lattice.xy()[seen], elevation[seen]]))
     low, high = points.min(axis=0), points.max(axis=0)
@@ -208,7 +205,7 @@ def _lead_to(back: Matches, marked: Bools) -> Bools:
 
 
 def _size(params: LocusParams, args: Mapping[str, Any], metas: Mapping[str, Any]) -> float:
-    """Bytes of the model's arrays, four of float32, and a half more for refining them."""
+    """Bytes of the model's arrays, three of float32, and as many for refining them."""
     if args["frame"] == "world":
         lattice = Lattice.from_dict(metas["local"]["lattice"])
     elif "no_ground" in metas["level"]:
@@ -250,7 +247,6 @@ class LocusInputs(NamedTuple):
     outputs=[
         raster("elevation", "m", "elevation of the cell centre", frame=_FRAME),
         raster("elevation_std", "m", "standard deviation of the elevation", frame=_FRAME),
-        raster("residual", "px", "mismatch of disparity and calibration at the elevation", frame=_FRAME),
         raster("ortho", "grey", "grey value of the left image, 0..255", frame=_FRAME),
     ],
     memory=Memory(lower=("locus.cell_size", "locus.extent"), size=_size),

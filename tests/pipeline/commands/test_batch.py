@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rille.pipeline.commands import batch
+from rille.pipeline.commands import complaints
 from rille.pipeline.commands.computing import reconstruct
 from rille.pipeline.runs.options import COMPLETE, FAILED, HOLES, USAGE, Options
 from rille.stages.core.errors import DegenerateError, InputError
@@ -21,14 +21,14 @@ ENDS = {
 }
 
 
-def run(names: list[str], *, keep_going: bool = True) -> tuple[int, batch.Ended]:
+def run(names: list[str], *, keep_going: bool = True) -> tuple[int, complaints.Ended]:
     def one(name: str) -> tuple[int, Path | str]:
         end = ENDS[name]
         if isinstance(end, Exception):
             raise end
         return end, Path(name)
 
-    return batch.each(names, one, keep_going=keep_going)
+    return complaints.each(names, one, keep_going=keep_going)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_an_interrupt_ends_the_command():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        batch.each(["a", "b"], one, keep_going=True)
+        complaints.each(["a", "b"], one, keep_going=True)
 
 
 def test_runs_are_listed_and_then_the_sequences_without_one(tmp_path, monkeypatch, capsys):

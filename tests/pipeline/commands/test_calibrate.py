@@ -12,8 +12,9 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import read_cameras, rig_of
-from rille.pipeline.commands.sequences.calibrate import Boards, _images, calibrate, cover, doubts
-from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual
+from rille.datasets.images.boards import images_of
+from rille.pipeline.commands.sequences.calibrate import calibrate
+from rille.stages.calibration.target import MODELS, BoardView, RigCalibration, ViewResidual, cover, doubts
 from rille.stages.geometry.geometry import Camera, RigidTransform
 from rille.stages.geometry.lens import Lens
 
@@ -175,7 +176,7 @@ def test_complaints_say_what_to_change(tmp_path):
 def test_hidden_files_beside_the_pictures_are_passed_over(tmp_path):
     folder = images(tmp_path / "a[1]")
     (folder / "._left0.png").touch()
-    assert [path.name for path in _images(folder)] == ["left0.png", "left1.png", "right0.png", "right1.png"]
+    assert [path.name for path in images_of(folder)] == ["left0.png", "left1.png", "right0.png", "right1.png"]
 
 
 @pytest.mark.data
@@ -247,5 +248,5 @@ def test_views_that_are_left_out_cover_nothing():
     sigma = {f"{side} {name}": 0.0 for side in ("left", "right") for name in ("fx", *MODELS["radtan4"])}
     seen = tuple(ViewResidual(v.name, 0.1, 0.1, 0.1, used=v.name == "used") for v in views)
     found = RigCalibration(lens, lens, RigidTransform.identity(), dict.fromkeys(sigma, 1.0), sigma, 0.1, seen)
-    told = doubts(found, Boards((2, 2), ((100, 80), (100, 80)), views), "radtan4")
+    told = doubts(found, views, ((100, 80), (100, 80)), "radtan4")
     assert [line[:7] for line in told] == ["RIL-698", "RIL-698"]

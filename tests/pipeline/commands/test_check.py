@@ -18,6 +18,7 @@ from rille.pipeline.runs import input_checks, session
 from rille.pipeline.runs.input_checks import judge_rig
 from rille.pipeline.runs.options import Settings
 from rille.stages.geometry.geometry import RigidTransform
+from rille.stages.geometry.lens import Lens
 
 ROWS, COLUMNS, MARGIN = 120, 200, 40
 
@@ -102,6 +103,15 @@ def test_swapped_folders_fail(tmp_path, capsys, monkeypatch):
     assert code == 1
     assert "swapped" in line(lines, "sides")
     assert [text.split()[:2] for text in lines if text.startswith("FAIL")] == [["FAIL", "sides"]]  # one fault, one line
+
+
+def test_matches_beyond_infinity_are_one_fault_and_one_line(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    k = "200 0 {} {} 0 200 59.5 0 0 0 1 0\n"
+    (path / "calib.txt").write_text(k.format(99.5, 0) + k.format(79.5, -200 * 0.16))
+    code, lines = run(path, capsys)
+    assert code == 1
+    assert [text.split()[:3] for text in lines if text.startswith("FAIL")] == [["FAIL", "rig", "RIL-772:"]]
 
 
 def test_a_first_pair_whose_sides_are_exchanged_is_named_and_another_is_matched(tmp_path, capsys):
@@ -219,13 +229,18 @@ def test_blurred_and_repeated_images(tmp_path, capsys):
     assert any("1 right images repeat the one before, first frame 003" in text for text in lines)
 
 
-def test_one_image_for_both_sides_fails(tmp_path, capsys):
+@pytest.mark.parametrize("distorted", [False, True])
+def test_one_image_for_both_sides_fails(tmp_path, capsys, distorted):
     path = folder(tmp_path / "wall", frames=2)
     for k in range(2):
         (path / "right" / f"{k:03d}.png").write_bytes((path / "left" / f"{k:03d}.png").read_bytes())
-    code, lines = run(path, capsys)
-    assert code == 1
-    assert any("one image in 2 pairs" in text for text in lines)
+    sequence = open_sequence(str(path))
+    if distorted:
+        cameras = {"left": sequence.rig.left, "right": sequence.rig.right}
+        unlike = {"left": (-0.1, 0.0, 0.0, 0.0), "right": (0.1, 0.0, 0.0, 0.0)}
+        sequence = replace(sequence, lenses={side: Lens(cameras[side], "radtan", k) for side, k in unlike.items()})
+    assert look(sequence, tmp_path / "cache") == 1
+    assert "one image in 2 pairs" in capsys.readouterr().out
 
 
 def test_blank_images_are_not_taken_for_one_image(tmp_path, capsys):

@@ -9,7 +9,8 @@ import pytest
 from raising import raises
 from rig_scenes import bed_depth, bed_rig, knocked, matches
 
-from rille.pipeline.commands.results.rig import _table, _toml, disagreements, joint, rig
+from rille.pipeline.commands.results.rig import _table, _toml, rig
+from rille.stages.calibration.joint_rig import disagreements, joint
 from rille.stages.calibration.rig import RigParams
 from rille.stages.geometry.epipolar import NAMES
 
@@ -22,13 +23,14 @@ def run(seed, count=3, noise=0.2, **knock):
     return [matches(true, bed_depth, pair=k, noise=noise, seed=10 * seed + k, samples=600) for k in range(count)]
 
 
-def test_runs_are_weighted_by_their_covariances():
+def test_a_run_of_less_certain_matches_counts_less():
     params = RigParams()
     found = joint(bed_rig(), {"a": run(1, **TURNED), "b": run(2, count=1, noise=0.6, **TURNED)}, params)
-    np.testing.assert_allclose(np.degrees(found.values[[PITCH, ROLL]]), [0.3, 0.4], atol=0.02)
+    values = np.array([parameter.value for parameter in found.parameters])
+    np.testing.assert_allclose(np.degrees(values[[PITCH, ROLL]]), [0.3, 0.4], atol=0.02)
     a, b = found.estimates
     assert b.sigma[PITCH] > a.sigma[PITCH]
-    assert abs(found.values[PITCH] - a.values[PITCH]) < abs(found.values[PITCH] - b.values[PITCH])
+    assert abs(values[PITCH] - a.values[PITCH]) < abs(values[PITCH] - b.values[PITCH])
     assert list(disagreements(found, params.significance)) == []
     assert found.rig.baseline == pytest.approx(bed_rig().baseline, abs=1e-12)
 

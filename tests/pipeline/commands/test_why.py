@@ -98,7 +98,7 @@ def test_differences_from_the_programs_defaults_are_marked():
     made = {
         "stage": "locus",
         "provenance": {
-            "params": stages()["locus"].params(max_residual=0.7).model_dump(mode="json"),
+            "params": stages()["locus"].params(max_range_cells=7.0).model_dump(mode="json"),
             "args": {"pair": 3},
             "code": {"rille.stages.terrain.locus.stage": "0"},
             "env": {},
@@ -108,7 +108,9 @@ def test_differences_from_the_programs_defaults_are_marked():
         },
     }
     lines = list(why._recipe(made))
-    assert [line for line in lines if "default:" in line] == ["parameter     locus.max_residual = 0.7   (default: 0.5)"]
+    assert [line for line in lines if "default:" in line] == [
+        "parameter     locus.max_range_cells = 7.0   (default: 6.0)"
+    ]
     assert "argument      pair = 3" in lines
     params = build().hfvm.model_dump(mode="json")
     shared = {"stage": "hfvm_given", "provenance": made["provenance"] | {"params": params}}

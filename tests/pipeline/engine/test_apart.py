@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from rille.pipeline.engine.runtime import apart
-from rille.pipeline.engine.runtime.apart import leave_out, take_back
+from rille.pipeline.engine.runtime import environment
+from rille.pipeline.engine.runtime.environment import leave_out, take_back
 
 RILLE = str(Path(sysconfig.get_path("scripts")) / "rille")
 
@@ -124,7 +124,7 @@ def test_the_client_leaves_the_current_folder_out(folder, command, path):
 
 
 def test_the_last_of_two_runs_in_one_interactive_python_takes_the_path_back(monkeypatch):
-    monkeypatch.setattr(apart, "_was_on_path", [])  # without other runs of this process
+    monkeypatch.setattr(environment, "_was_on_path", [])  # without other runs of this process
     monkeypatch.setattr(sys, "path", ["", *sys.path])
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     leave_out()
@@ -164,6 +164,6 @@ def test_a_user_without_a_home_has_a_folder_for_matplotlib(monkeypatch, tmp_path
     for home, own in ((tmp_path, False), (tmp_path / "nonexistent", True)):
         monkeypatch.delenv("MPLCONFIGDIR", raising=False)
         monkeypatch.setenv("HOME", str(home))
-        apart.ignore_settings()
+        environment.ignore_settings()
         assert ("MPLCONFIGDIR" in os.environ) is own
     assert Path(os.environ["MPLCONFIGDIR"]).parent.is_dir()

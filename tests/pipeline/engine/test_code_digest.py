@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rille.pipeline.engine import code_digest
+from rille.pipeline.engine import keys
 
 FILES = {
     "__init__.py": '"""Package."""\n',
@@ -25,7 +25,13 @@ FILES = {
     "stranger.py": "Y = 1\n",
 }
 
-CACHED = (code_digest._read, code_digest._file, code_digest._roots, code_digest.module_digests, code_digest.code_digest)
+CACHED = (
+    keys._read,
+    keys._file,
+    keys._roots,
+    keys.module_digests,
+    keys.code_digest,
+)
 
 
 @pytest.fixture
@@ -43,7 +49,7 @@ def package(tmp_path, monkeypatch):
         (root / name).write_text(text.replace(old, new) if old else text + new)
         for cached in CACHED:
             cached.cache_clear()
-        return code_digest.code_digest("own_toy.main")
+        return keys.code_digest("own_toy.main")
 
     yield change
     for cached in CACHED:
@@ -53,7 +59,7 @@ def package(tmp_path, monkeypatch):
 
 def test_reaches_helpers_at_any_depth_and_no_strangers(package):
     package()
-    assert set(code_digest.module_digests("own_toy.main")) == {
+    assert set(keys.module_digests("own_toy.main")) == {
         "own_toy", "own_toy.main", "own_toy.near", "own_toy.deep", "own_toy.deep.inner", "own_toy.sibling",
     }  # fmt: skip
 
@@ -104,7 +110,7 @@ def test_imports_for_type_checkers_do_not_count(package):
 def test_a_running_process_keeps_what_it_read(package, tmp_path):
     before = package()
     (tmp_path / "own_toy" / "sibling.py").write_text("LIMIT = 7\n")
-    assert code_digest.code_digest("own_toy.main") == before
+    assert keys.code_digest("own_toy.main") == before
 
 
 def test_every_stage_reaches_the_declarations():
@@ -113,10 +119,8 @@ def test_every_stage_reaches_the_declarations():
         "rille.stages.core.declare",
         "rille.stages.odometry.keyframes",
         "rille.stages.core.errors",
-    } <= set(code_digest.module_digests("rille.stages.odometry.keyframes"))
-    assert not any(
-        name.startswith("rille.pipeline") for name in code_digest.module_digests("rille.stages.odometry.keyframes")
-    )
+    } <= set(keys.module_digests("rille.stages.odometry.keyframes"))
+    assert not any(name.startswith("rille.pipeline") for name in keys.module_digests("rille.stages.odometry.keyframes"))
 
 
 def modules():
@@ -135,12 +139,12 @@ def test_an_edit_of_the_planner_compiles_no_kernel_of_another_room():
     others = [name for name in kernels if not name.startswith(("rille.stages.planning", "rille.stages.driving"))]
     assert len(others) > 20
     for name in others:
-        assert not any(".planning" in reached for reached in code_digest.module_digests(name)), name
+        assert not any(".planning" in reached for reached in keys.module_digests(name)), name
 
 
 def test_what_walks_the_whole_sequence_hangs_on_no_matcher():
     for name in ("steps", "keyframes", "frame_screening"):
-        reached = code_digest.module_digests(f"rille.stages.odometry.{name}")
+        reached = keys.module_digests(f"rille.stages.odometry.{name}")
         assert not any(".hfvm" in module for module in reached), name
 
 
@@ -151,7 +155,7 @@ def test_no_stage_loads_code_or_tables_that_its_digest_does_not_see():
         module
         for name, text in modules().items()
         if re.search(r"^(STAGE = |@stage\()", text, re.MULTILINE)
-        for module in code_digest.module_digests(name)
+        for module in keys.module_digests(name)
     }
     found = {name for name, text in modules().items() if name in reached and hidden.search(text)}
     # the one asks for the declaration of the images that it changes, whose values are its input; the other reads C
@@ -162,7 +166,7 @@ def test_no_stage_loads_code_or_tables_that_its_digest_does_not_see():
 
 def test_an_unknown_module_is_named():
     with pytest.raises(ModuleNotFoundError, match=r"stages\.nowhere"):
-        code_digest.code_digest("rille.stages.nowhere")
+        keys.code_digest("rille.stages.nowhere")
 
 
 @pytest.fixture
@@ -170,8 +174,8 @@ def memory(tmp_path, monkeypatch):
     """``memory()``: what a new process finds in the file of the memory, from then on in use."""
 
     def reread():
-        found = code_digest._Memory(tmp_path / "cache" / "sources.json")
-        monkeypatch.setattr(code_digest, "_memory", lambda: found)
+        found = keys._Memory(tmp_path / "cache" / "sources.json")
+        monkeypatch.setattr(keys, "_memory", lambda: found)
         return found
 
     reread()
@@ -180,8 +184,8 @@ def memory(tmp_path, monkeypatch):
 
 def test_what_was_found_in_sources_is_remembered_by_their_bytes(package, memory, monkeypatch):
     first, edited = package(), package("sibling.py", "5", "6")
-    code_digest.remember()
-    monkeypatch.setattr(code_digest.ast, "parse", lambda _: pytest.fail("a file was parsed again"))
+    keys.remember()
+    monkeypatch.setattr(keys.ast, "parse", lambda _: pytest.fail("a file was parsed again"))
     memory()
     assert package() == edited
     assert package("sibling.py", "6", "5") == first
@@ -198,10 +202,10 @@ def test_one_source_is_parsed_at_a_time(package, memory, monkeypatch, tmp_path):
         under_way.pop()
         return parse(*given)
 
-    monkeypatch.setattr(code_digest.ast, "parse", slow)
+    monkeypatch.setattr(keys.ast, "parse", slow)
     files = [tmp_path / "own_toy" / name for name in FILES]
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda path: code_digest._read(f"own_toy.{path.stem}", path), files))
+        list(pool.map(lambda path: keys._read(f"own_toy.{path.stem}", path), files))
     assert len(most) > 4
     assert max(most) == 1
 
@@ -209,7 +213,7 @@ def test_one_source_is_parsed_at_a_time(package, memory, monkeypatch, tmp_path):
 def test_a_damaged_memory_of_sources_is_none(package, memory, tmp_path):
     file = tmp_path / "cache" / "sources.json"
     first = package()
-    code_digest.remember()
+    keys.remember()
     whole = file.read_bytes()
     for damaged in (b"", whole[:-20], b"[]", b"{}", whole.replace(b"own_toy.near.half", b"own_toy.near.hall")):
         file.write_bytes(damaged)
@@ -221,4 +225,4 @@ def test_a_damaged_memory_of_sources_is_none(package, memory, tmp_path):
 
 def test_poses_of_a_segment_do_not_depend_on_what_judges_all_segments():
     room = "rille.stages.odometry.resection"
-    assert f"{room}.intrinsics" not in code_digest.module_digests(f"{room}.resect")
+    assert f"{room}.intrinsics" not in keys.module_digests(f"{room}.resect")

@@ -17,10 +17,11 @@ import numba.core.caching
 import pytest
 from toys.numbers import NumbersParams
 
-from rille.pipeline.engine import progress
-from rille.pipeline.engine.graph import Graph, Took
+from rille.pipeline.engine import events
+from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.runtime.kernels import Compiling, Locator
+from rille.pipeline.engine.task import Took
 
 ROOT = Path(__file__).resolve().parents[3]
 CALLEE = "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return x * 2\n"
@@ -173,7 +174,7 @@ def test_of_several_processes_one_compiles(checkout):
 
 def test_a_run_says_what_it_compiled():
     stream = io.StringIO()
-    shown = progress.Lines(stream)
+    shown = events.Lines(stream)
     handle = Graph().node("toys.numbers", "n", NumbersParams(), {"frame": 0})
     shown.open()
     shown.resolved(handle, 2, Took())

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from toys.scale import ScaleParams
 
 from rille.pipeline.engine.keys import digest, text
-from rille.pipeline.engine.spec import Spec, key_of, recipe
-from rille.pipeline.engine.store.manifest import Ref
+from rille.pipeline.engine.store.artifact import Ref
+from rille.pipeline.engine.task import Spec, key_of, recipe
 from rille.stages.core.declare import Params
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)

@@ -16,7 +16,7 @@ import pytest
 from raising import raises
 
 from rille import datasets, stages
-from rille.pipeline.engine import code_digest, packages
+from rille.pipeline.engine import keys
 from rille.stages.core.declare import declared
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -34,7 +34,7 @@ def stage_modules() -> list[str]:
 
 @pytest.mark.parametrize("module", stage_modules())
 def test_no_package_is_forgotten_or_missing(module):
-    found = packages.versions(module)
+    found = keys.versions(module)
     assert "numpy" in found
     for name, version in found.items():
         assert version.partition(" ")[0] == importlib.metadata.version(name)
@@ -54,19 +54,19 @@ def test_packages_come_from_the_imports_of_all_that_is_reached(tmp_path, monkeyp
     (folder / "main.py").write_text("import json\nfrom own_kit import far\n")
     (folder / "far.py").write_text("from typing import TYPE_CHECKING\ndef f():\n    import cv2.aruco, yaml\n")
     monkeypatch.syspath_prepend(tmp_path)
-    for cached in (code_digest._roots, code_digest._file, code_digest.module_digests):
+    for cached in (keys._roots, keys._file, keys.module_digests):
         cached.cache_clear()
-    assert code_digest.external_imports("own_kit.main") == {"cv2", "yaml"}
-    assert {name.lower() for name in packages.versions("own_kit.main")} == {"opencv-python-headless", "pyyaml"}
+    assert keys.external_imports("own_kit.main") == {"cv2", "yaml"}
+    assert {name.lower() for name in keys.versions("own_kit.main")} == {"opencv-python-headless", "pyyaml"}
     (folder / "far.py").write_text("import no_such_package\n")
-    for cached in (code_digest._read, code_digest.module_digests):
+    for cached in (keys._read, keys.module_digests):
         cached.cache_clear()
     with raises("RIL-530", "no_such_package"):
-        packages.versions("own_kit.main")
+        keys.versions("own_kit.main")
 
 
 KINDS = """
-from rille.pipeline.engine.packages import version
+from rille.pipeline.engine.keys import version
 print([version(name) for name in ("numpy", "scipy", "opencv-python-headless")])
 """
 

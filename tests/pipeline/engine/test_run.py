@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import signal
+import sys
 import time
 import traceback
 from collections import Counter
@@ -16,15 +17,13 @@ from toys.chain import build
 from toys.numbers import NumbersParams
 from toys.scale import ScaleParams
 
-from rille.pipeline.engine import events as ledger
-from rille.pipeline.engine import packages, progress, provenance
+from rille.pipeline.engine import events, keys, provenance
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine import workers as base
 from rille.pipeline.engine.graph import Graph, Maybe
-from rille.pipeline.engine.spec import Spec, recipe
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.task import ensure
+from rille.pipeline.engine.task import Spec, ensure, recipe
 from rille.stages.core.declare import NoParams
 
 NO = NoParams()
@@ -150,7 +149,7 @@ def test_where_healing_fails_all_that_waits_is_left_out_and_told(cache, tmp_path
         ledger=tmp_path / "ledger.jsonl",
     )
     assert [f.label for f in result.failures] == ["first"]
-    told = {row["label"]: (row["status"], row["reason"]) for row in ledger.read(tmp_path / "ledger.jsonl")}
+    told = {row["label"]: (row["status"], row["reason"]) for row in events.read(tmp_path / "ledger.jsonl")}
     assert told.pop("first")[0] == "failed"
     by = {"second": "first failed", "last": "second was skipped", "rest": "last was skipped"}
     assert told == {label: ("skipped", reason) for label, reason in by.items()}
@@ -174,7 +173,7 @@ def test_what_waits_for_healing_goes_on_if_another_worker_has_healed_it(cache, t
     graph, result = run(cache, make=in_a_row("first", "last"), ledger=tmp_path / "ledger.jsonl")
     assert result.ok
     assert statuses(graph) == {"first": "cached", "last": "computed"}
-    assert [row["label"] for row in ledger.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"
+    assert [row["label"] for row in events.read(tmp_path / "ledger.jsonl")] == ["first", "last"], "one line a node"
 
 
 def test_dry_run_computes_nothing_and_explains(cache):
@@ -237,7 +236,7 @@ def test_without_keep_going_nothing_new_is_begun(cache, tmp_path):
         ("value/after", "value/third", "fine", "fine/after", "fine/third"), "skipped"
     )
     assert not result.ok
-    rows = {r["label"]: r for r in ledger.read(tmp_path / "ledger.jsonl")}
+    rows = {r["label"]: r for r in events.read(tmp_path / "ledger.jsonl")}
     assert rows["value"]["error"] == {"type": "ValueError", "message": "negative depth"}
     assert rows["value/after"]["reason"] == "value failed"
     assert rows["value/third"]["reason"] == "value/after was skipped"
@@ -249,7 +248,7 @@ def test_with_keep_going_the_rest_finishes_and_the_ledger_accounts_for_all(cache
     graph, result = run(cache, make=mischief("value", "degenerate", "fine"), keep_going=True, ledger=file)
     assert {h.label for h in graph.nodes if h.done} == {"fine", "fine/after", "fine/third"}
     assert (result.counts["computed"], result.counts["failed"], result.counts["skipped"]) == (3, 2, 4)
-    rows = ledger.read(file)
+    rows = events.read(file)
     assert sorted(r["label"] for r in rows) == sorted(h.label for h in graph.nodes)
     assert {r["key"] for r in rows if r["status"] == "computed"} == {h.key for h in graph.nodes if h.done}
     assert all(r["digest"] and r["seconds"] > 0 for r in rows if r["status"] == "computed")
@@ -314,7 +313,7 @@ def test_a_flow_that_fails_is_a_failure_and_one_that_cannot_go_on_is_noted(cache
 
     _, result = run(cache, make=make, keep_going=True, ledger=tmp_path / "l")
     assert [f.label for f in result.failures] == ["plan after n", "value"]
-    assert ledger.read(tmp_path / "l")[-1] == {
+    assert events.read(tmp_path / "l")[-1] == {
         "label": "plan after value",
         "stage": "",
         "status": "skipped",
@@ -351,7 +350,7 @@ def test_an_interrupt_where_python_forgets_it_stops_the_run_all_the_same(cache, 
 
     with pytest.raises(KeyboardInterrupt):
         run(cache, make=make, ledger=tmp_path / "ledger.jsonl")
-    assert "ok" not in ledger.facts(tmp_path / "ledger.jsonl"), "it did not come to its end"
+    assert "ok" not in events.facts(tmp_path / "ledger.jsonl"), "it did not come to its end"
     assert [node.status for node in done] == ["pending"], "the flow went on, the run did not"
     assert capfd.readouterr().err == ""
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -368,7 +367,7 @@ def test_what_was_created_first_runs_first(cache, tmp_path):
             graph.node("toys.numbers", label, NumbersParams(), {"frame": frame})
 
     run(cache, make=make, ledger=tmp_path / "l")
-    assert [row["label"] for row in ledger.read(tmp_path / "l")] == ["a", "b", "c", "d"]
+    assert [row["label"] for row in events.read(tmp_path / "l")] == ["a", "b", "c", "d"]
 
 
 def test_a_miss_is_explained_against_the_most_similar_artifact(cache):
@@ -409,7 +408,7 @@ def test_manifest_says_where_a_result_comes_from(cache):
     assert about["params"] == {"offset": 0.0}
     assert about["inputs"] == {"values": graph.nodes[0].ref.digest}
     assert set(about["code"]) >= {"toys.scale", "toys.helper", "rille.stages.core.declare"}
-    assert about["env"] == {"numpy": packages.version("numpy")}
+    assert about["env"] == {"numpy": keys.version("numpy")}
     assert about["seconds"] >= 0
     assert about["peak_rss"] > 1e6
 
@@ -440,7 +439,7 @@ def test_arguments_without_canonical_form_are_named(cache):
 
 
 def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
-    shown = progress.Progress()
+    shown = events.Progress()
     shown.close = lambda: setattr(shown, "closed", True)
     with pytest.raises(OSError, match="/dev/full"):
         run(cache, make=mischief("fine"), ledger=Path("/dev/full"), progress=shown)
@@ -449,9 +448,9 @@ def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
 
 @pytest.mark.parametrize("mode", ["plain", "quiet", "bar"])
 def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
-    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    monkeypatch.setattr(events, "INTERVAL", 0.0)
     stream = io.StringIO()
-    run(cache, make=mischief("fine", "value"), progress=progress.make(mode, stream))
+    run(cache, make=mischief("fine", "value"), progress=events.make(mode, stream))
     text = stream.getvalue()
     if mode == "quiet":
         assert text == ""
@@ -463,3 +462,21 @@ def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
 def test_no_workers_are_refused(cache):
     with raises("RIL-540"):
         run(cache, jobs=0)
+
+
+def test_a_task_passes_few_modules_from_the_graph_to_its_artifact(cache):
+    """Whoever follows a task reads these: a new station needs a reason."""
+    graph, passed, room = Graph(), set(), f"{Path(driver.__file__).parent}/"
+
+    def note(frame, event, _):
+        if event == "call" and frame.f_code.co_filename.startswith(room) and frame.f_code.co_name != "<module>":
+            passed.add(frame.f_code.co_filename.removeprefix(room))
+
+    build(graph)
+    sys.setprofile(note)
+    try:
+        driver.run(graph, Store(cache), driver.RunOptions(executor="inline")).check()
+    finally:
+        sys.setprofile(None)
+    assert {"run.py", "task.py", "store/base.py"} <= passed
+    assert len(passed) <= 15, sorted(passed)

@@ -25,9 +25,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as st_numpy
 from raising import raises
 
-from rille.pipeline.engine.store import archive, maintenance, zarr_group
+from rille.pipeline.engine.store import arrays, artifact, maintenance
+from rille.pipeline.engine.store.arrays import array_digests, output_digest
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.pipeline.runs.options import cache_folder
 from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
@@ -88,9 +88,9 @@ def rewrite(path, changes, **options):
 def forge(path, change):
     """Change the manifest, its checksum right."""
     with zipfile.ZipFile(path) as old:
-        made = json.loads(old.read(archive.MANIFEST))
+        made = json.loads(old.read(artifact.MANIFEST))
     change(made)
-    rewrite(path, {archive.MANIFEST: json.dumps(made)})
+    rewrite(path, {artifact.MANIFEST: json.dumps(made)})
 
 
 def test_round_trip_keeps_every_bit_and_the_digest(cache):
@@ -232,7 +232,7 @@ def test_a_manifest_that_is_wrong_by_intent_counts_as_damaged(cache, change):
 @pytest.mark.parametrize("text", [b"[" * 100_000, b'{"path": ' * 50_000, b"[]", b"1" * 5000, b"", b"\xff"])
 def test_a_manifest_that_is_no_object_is_damaged(cache, text):
     commit(cache)
-    rewrite(file_of(cache), {archive.MANIFEST: text})
+    rewrite(file_of(cache), {artifact.MANIFEST: text})
     assert Store(cache).lookup("toy", KEY) is None
 
 
@@ -261,7 +261,7 @@ def test_what_no_archive_is_neither_blocks_nor_fills_the_memory(cache, way):
     assert commit(cache) == ref
 
 
-@pytest.mark.parametrize("name", ["elevation/c.0.0", archive.MANIFEST])
+@pytest.mark.parametrize("name", ["elevation/c.0.0", artifact.MANIFEST])
 def test_a_member_that_might_unpack_to_any_size_is_refused(cache, name):
     ref = commit(cache)
     content = zipfile.ZipFile(file_of(cache)).read(name)
@@ -276,7 +276,7 @@ def test_a_member_that_might_unpack_to_any_size_is_refused(cache, name):
 
 def test_a_chunk_never_unpacks_to_another_size(cache):
     ref = commit(cache)
-    rewrite(file_of(cache), {"elevation/c.0.0": zarr_group.codec().encode(np.zeros((5, 8), np.float32))})
+    rewrite(file_of(cache), {"elevation/c.0.0": arrays.codec().encode(np.zeros((5, 8), np.float32))})
     with raises("RIL-504", "another size"):
         Store(cache).open(ref)["elevation"]
     commit(cache)
@@ -402,7 +402,7 @@ def chunks(cache):
     ],
 )
 def test_large_arrays_are_chunked(cache, shape, count):
-    assert zarr_group.CHUNK == 1024
+    assert arrays.CHUNK == 1024
     big = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": big}, {}))
     assert len(chunks(cache)) == count
@@ -415,14 +415,14 @@ def test_large_arrays_are_chunked(cache, shape, count):
 def test_an_array_is_stored_as_zarr_stores_it(shape, dtype):
     values = (np.random.default_rng(0).normal(size=shape) * 9).astype(dtype)
     stage = replace(STAGE, outputs=(Array("values", tuple("ab"[: len(shape)]), dtype, "1", "values"),))
-    files, _ = zarr_group.encode(stage, Bundle({"values": values}, {}))
+    files, _ = arrays.encode(stage, Bundle({"values": values}, {}))
     stored = {}
     zarr.create_array(
         zarr.storage.MemoryStore(stored),
         name="values",
         shape=shape,
         dtype=dtype,
-        chunks=tuple(max(min(n, zarr_group.CHUNK), 1) for n in shape),
+        chunks=tuple(max(min(n, arrays.CHUNK), 1) for n in shape),
         compressors=zarr.codecs.BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"),
         fill_value=np.nan if values.dtype.kind == "f" else 0,
         dimension_names=tuple("ab"[: len(shape)]),
@@ -443,8 +443,8 @@ def test_of_a_window_only_the_chunks_are_read_that_it_touches(cache, monkeypatch
     elevation = np.random.default_rng(0).random((2500, 1100), np.float32)
     ref = Store(cache).commit(STAGE, KEY, Bundle({"elevation": elevation, "flag": np.zeros((2, 2), bool)}, {}))
     opened, names = Store(cache).open(ref).arrays, []
-    member = archive.Archive.member
-    monkeypatch.setattr(archive.Archive, "member", lambda self, *args: names.append(args[0]) or member(self, *args))
+    member = artifact.Archive.member
+    monkeypatch.setattr(artifact.Archive, "member", lambda self, *args: names.append(args[0]) or member(self, *args))
     part = opened.raster("elevation")[1000:1040, 5:9]
     np.testing.assert_array_equal(part, elevation[1000:1040, 5:9])
     assert names == ["elevation/c.0.0", "elevation/c.1.0"]
@@ -459,16 +459,16 @@ def test_a_window_is_that_of_the_array(tmp_path_factory, data):
     cache = tmp_path_factory.mktemp("windows")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
-        patch.setattr(zarr_group, "CHUNK", 4)
+        patch.setattr(arrays, "CHUNK", 4)
         shape = data.draw(st_numpy.array_shapes(min_dims=2, max_dims=2, min_side=0, max_side=11))
         values = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
-        arrays = Store(cache).open(Store(cache).commit(STAGE, KEY, Bundle({"elevation": values}, {}))).arrays
+        read = Store(cache).open(Store(cache).commit(STAGE, KEY, Bundle({"elevation": values}, {}))).arrays
     for _ in range(4):
         window = tuple(slice(*sorted(data.draw(st.tuples(*[st.integers(0, n)] * 2)))) for n in shape)
-        raster = arrays.raster("elevation")
+        raster = read.raster("elevation")
         assert raster.shape == shape
         np.testing.assert_array_equal(raster[window], values[window])
-    np.testing.assert_array_equal(arrays["elevation"], values)
+    np.testing.assert_array_equal(read["elevation"], values)
 
 
 def test_chunks_of_nothing_are_members_too(cache):

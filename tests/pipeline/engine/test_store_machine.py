@@ -20,10 +20,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from raising import raises
 
 from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.arrays import DamagedError, array_digests, output_digest
+from rille.pipeline.engine.store.artifact import artifact_path
 from rille.pipeline.engine.store.base import GoneError, Store
-from rille.pipeline.engine.store.lazy_arrays import DamagedError
-from rille.pipeline.engine.store.manifest import artifact_path
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 from rille.stages.core.declare import Array, Bundle, NoParams, Stage
 
 STAGE = Stage(

@@ -23,8 +23,7 @@ from rille.stages.terrain.merge import MergeParams, ModelLayer
 
 def arrays() -> dict:
     z = elevation()
-    model = {"elevation": z, "elevation_std": np.full_like(z, 0.01), "residual": np.zeros_like(z)}
-    model["ortho"] = np.full_like(z, 90)
+    model = {"elevation": z, "elevation_std": np.full_like(z, 0.01), "ortho": np.full_like(z, 90)}
     layer = ModelLayer(4, LATTICE, lambda name, window: model[name][window])
     found = merge.merge([layer], LATTICE, MergeParams())._asdict()
     return {spec.name: (spec, found[spec.name]) for spec in merge.merge_stage.outputs if spec.name in found}

@@ -55,7 +55,7 @@ def lay_out(
         deciding = [w for w in graph.waiting if w[0][0].stage in ("frame_screening", "keyframes")]
         deciding[-1][1](SimpleNamespace(meta=meta))
     for stage, meta in doubts or [("rig", {})]:
-        handles, go_on, _ = [w for w in graph.waiting if w[0][0].stage == stage][-1]
+        handles, go_on = [w for w in graph.waiting if w[0][0].stage == stage][-1]
         facts = found | meta if stage == "keyframes" else meta
         for handle in handles:
             handle.error = ValueError() if handle.label in facts.get("failed", ()) else None
@@ -65,10 +65,10 @@ def lay_out(
         facts = {"keyframes": found, "ground_frame": ground or GROUND, "intrinsics": asked}
         for stage in [*(("keyframes", "rig") if turn else ()), "ground_frame", "resect", "intrinsics"]:
             of = (jumps or {}) if stage == "resect" else {}
-            for handles, go_on, _ in [w for w in graph.waiting if w[0][0].stage == stage][-1:]:
+            for handles, go_on in [w for w in graph.waiting if w[0][0].stage == stage][-1:]:
                 go_on(*(SimpleNamespace(meta=of.get(h.label, facts.get(stage, {}))) for h in handles))
     for name in ("ground_frame", "trajectory"):
-        for handles, go_on, _ in list(graph.waiting):
+        for handles, go_on in list(graph.waiting):
             if handles[0].label.startswith(name) and len(handles) == 1:
                 go_on(SimpleNamespace(meta=trajectory if name == "trajectory" else ground or GROUND))
     return graph, products

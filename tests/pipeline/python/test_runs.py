@@ -18,7 +18,7 @@ from toys.browser import Browser
 
 import rille
 from rille.pipeline.cli import main
-from rille.pipeline.engine import code_digest, events
+from rille.pipeline.engine import events, keys
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.python import arguments, runs
 from rille.pipeline.runs.options import Options
@@ -217,7 +217,7 @@ def test_its_examples_run() -> None:
 
 
 def test_no_stage_of_the_package_depends_on_it() -> None:
-    assert "rille.pipeline" in (found := code_digest.module_digests("rille.pipeline.engine.plain"))
+    assert "rille.pipeline" in (found := keys.module_digests("rille.pipeline.engine.plain"))
     assert "rille.pipeline.python.runs" not in found
 
 

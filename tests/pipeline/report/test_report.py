@@ -18,7 +18,7 @@ from rille.datasets.georeference import Georeference
 from rille.datasets.mockup.sequence import vehicle_at_scale
 from rille.pipeline.export.view import TaskRow
 from rille.pipeline.flow.products import Driven, Products
-from rille.pipeline.report import canvas, figures, gather, metrics, ranges, strips
+from rille.pipeline.report import canvas, figures, gather, metrics, strips
 from rille.pipeline.report.delivery import lacking
 from rille.stages.core import quantities
 from rille.stages.core.declare import Bundle
@@ -125,7 +125,7 @@ def test_the_median_of_a_large_map_of_which_little_is_known_is_that_of_all_that_
     rng = np.random.default_rng(0)
     values = np.full(4_000_000, np.nan)
     values[rng.choice(values.size, 2000, replace=False)] = np.arange(2000.0)
-    assert len(ranges.sample(values.reshape(2000, 2000))) == 2000
+    assert len(canvas.sample(values.reshape(2000, 2000))) == 2000
 
 
 def test_error_never_without_completeness(whole: Written) -> None:
@@ -347,16 +347,16 @@ def test_signed_lengths_have_a_plus_where_they_are_positive() -> None:
 
 def test_limits_are_robust_and_never_empty() -> None:
     values = np.concatenate([np.linspace(0, 1, 1000), [1e6]])
-    assert ranges.limits(values)[1] < 1.0
+    assert canvas.limits(values)[1] < 1.0
     for constant in (np.full(5, np.nan), np.zeros(5), np.full(5, 3.0)):
-        low, high = ranges.limits(constant)
+        low, high = canvas.limits(constant)
         assert high > low
 
 
 def test_ground_limits_ignore_crowns() -> None:
     ground = np.linspace(-1.7, -1.6, 900)
     crowns = np.full(90, 2.0)
-    low, high = ranges.ground_limits(np.concatenate([ground, crowns]))
+    low, high = canvas.ground_limits(np.concatenate([ground, crowns]))
     # The ground spreads by 0.1 m: its robust deviation is 0.037 m, five of them 0.19 m.
     assert -1.7 <= low < -1.69
     assert -1.6 <= high < -1.4

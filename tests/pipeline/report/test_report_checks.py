@@ -9,21 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toys.finished import (
-    BASIC,
-    FRAMES,
-    Written,
-    bundles,
-    checked,
-    checks,
-    products,
-    view,
-    written,
-)
+from toys.finished import BASIC, FRAMES, Written, bundles, checked, checks, products, view, written
 
 from rille.datasets.georeference import Georeference
-from rille.pipeline.export.comparison import compare
 from rille.pipeline.report import figures, gather, summary
+from rille.pipeline.report.gather import compare
 from rille.stages.core.declare import Bundle
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform
 from rille.stages.hazard.risk import RiskParams

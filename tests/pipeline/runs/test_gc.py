@@ -13,8 +13,8 @@ from toys.chain import run
 from rille.pipeline.commands import cache as commands
 from rille.pipeline.engine.runtime import kernels
 from rille.pipeline.engine.store import maintenance
+from rille.pipeline.engine.store.artifact import artifact_path
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.manifest import artifact_path
 from rille.pipeline.runs import lookup
 
 

@@ -16,9 +16,9 @@ from rille.pipeline.commands import cache
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.runtime import atomic
+from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
-from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.runs import roots
+from rille.pipeline.engine.store.maintenance import artifacts, note_runs, noted_runs
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def used(tmp_path: Path) -> Store:
     (folder / "toy" / "1").mkdir(parents=True)
     chain.build(graph)
     driver.run(graph, store, driver.RunOptions(executor="inline", ledger=folder / "toy" / "1" / "ledger.jsonl"))
-    roots.note(store, folder)
+    note_runs(store, folder)
     for path in store.root.glob("artifacts/*/*/*.zip"):
         os.utime(path, (0, 0))
     return store
@@ -41,10 +41,10 @@ def collect(store: Store, runs: Path) -> int:
 
 def test_clearing_up_from_elsewhere_keeps_what_known_runs_need(used, tmp_path, monkeypatch):
     assert collect(used, tmp_path / "elsewhere" / "runs") == 9
-    roots.note(used, tmp_path / "work" / "runs")
+    note_runs(used, tmp_path / "work" / "runs")
     assert len(list((used.root / "roots").iterdir())) == 1, "noted once"
-    monkeypatch.setattr(roots.platform, "node", lambda: "another")
-    roots.note(used, tmp_path / "work" / "runs")
+    monkeypatch.setattr(maintenance.platform, "node", lambda: "another")
+    note_runs(used, tmp_path / "work" / "runs")
     assert len(list((used.root / "roots").iterdir())) == 2, "by each machine: there, the folder may be another one"
 
 
@@ -69,8 +69,8 @@ def test_a_cache_that_may_only_be_read_is_used_without_a_note(used, tmp_path, mo
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
     monkeypatch.setattr(atomic, "write", refuse)
-    roots.note(used, tmp_path / "mine")
-    assert roots.folders(used, tmp_path) == sorted([tmp_path, tmp_path / "work" / "runs"])
+    note_runs(used, tmp_path / "mine")
+    assert noted_runs(used, tmp_path) == sorted([tmp_path, tmp_path / "work" / "runs"])
 
 
 def test_what_may_not_be_removed_is_no_success(used, tmp_path, monkeypatch):

@@ -12,7 +12,6 @@ def _run(params, args, inputs):
     maps = {
         "elevation": rng.normal(size=lattice.shape),
         "elevation_std": rng.uniform(0.1, 0.3, lattice.shape),
-        "residual": rng.uniform(0, 0.3, lattice.shape),
         "ortho": rng.uniform(0, 255, lattice.shape),
     }
     r, c = np.mgrid[:20, :20] - 9.5
@@ -26,8 +25,6 @@ STAGE = Stage(
     summary="disk",
     params=NoParams,
     inputs=(),
-    outputs=tuple(
-        Array(n, ("row", "col"), "float32", "m", n, "nan") for n in ("elevation", "elevation_std", "residual", "ortho")
-    ),
+    outputs=tuple(Array(n, ("row", "col"), "float32", "m", n, "nan") for n in ("elevation", "elevation_std", "ortho")),
     run=_run,
 )

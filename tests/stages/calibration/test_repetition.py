@@ -33,7 +33,7 @@ def test_matches_on_a_pattern_that_repeats_are_doubted(rows: bool) -> None:
 
 
 @pytest.mark.parametrize("rows", [True, False])
-@pytest.mark.parametrize(("scale", "turn_deg"), [(1.0, 0.0), (1.7, 20.0), (0.6, -15.0)])
+@pytest.mark.parametrize(("scale", "turn_deg"), [(1.0, 0.0), (1.7, 20.0), (0.6, -15.0), (1.7, 0.0), (1.0, 20.0)])
 def test_a_right_image_that_is_turned_and_scaled_repeats_no_more(scale: float, turn_deg: float, rows: bool) -> None:
     rng = np.random.default_rng(1)
     scene = cv2.GaussianBlur(rng.normal(0, 1, (240, 320)), (0, 0), 4.0)

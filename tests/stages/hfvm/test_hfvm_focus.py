@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matching_scenes import seen
 
-from rille.pipeline.runs.doubts import doubts
+from rille.stages.calibration.doubt import doubts
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import match

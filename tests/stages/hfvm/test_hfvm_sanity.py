@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from matching_scenes import Texture, convergent_rig, pair, rig_displacement
 
-from rille.pipeline.runs.doubts import doubts
 from rille.stages.calibration import doubt
+from rille.stages.calibration.doubt import doubts
 from rille.stages.core.validity import matched
 from rille.stages.hfvm.stage import match
 

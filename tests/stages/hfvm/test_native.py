@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rille.pipeline.engine.code_digest import module_digests
+from rille.pipeline.engine.keys import module_digests
 from rille.stages.hfvm.native import build, reference
 from rille.stages.hfvm.native.library import Library
 from rille.stages.hfvm.native.problem import Field, LevelPair, Map, Smoothing, pack_map

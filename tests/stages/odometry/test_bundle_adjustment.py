@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rille.pipeline.engine.store.output_digest import output_digest
+from rille.pipeline.engine.store.arrays import output_digest
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.geometry.projection import perturbed
 from rille.stages.odometry.resection.bundle_adjustment import (

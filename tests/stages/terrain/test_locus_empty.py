@@ -30,9 +30,9 @@ def test_cameras_that_look_away_are_told_with_what_each_sees() -> None:
     assert "T_right_left" in told
 
 
-def test_no_valid_disparity_and_contradicting_ones_are_two_things() -> None:
+def test_no_valid_disparity_and_none_on_the_surface_are_two_things() -> None:
     assert "76800" in reason(usable=~GOOD)
     told = reason()
     assert "76800 valid disparities" in told
     assert f"none of {AHEAD.rows * AHEAD.cols} cells" in told
-    assert "locus.max_residual" in told
+    assert "locus.max_sigma" in told

@@ -31,13 +31,10 @@ def layer(
     pair: int,
     elevation: object,
     std: object = 0.1,
-    residual: object = 0.0,
     ortho: object = 100.0,
     lattice: Lattice = TILE,
 ) -> ArrayLayer:
-    arrays = (
-        np.broadcast_to(np.asarray(v, np.float32), lattice.shape).copy() for v in (elevation, std, residual, ortho)
-    )
+    arrays = (np.broadcast_to(np.asarray(v, np.float32), lattice.shape).copy() for v in (elevation, std, ortho))
     return ArrayLayer(pair, lattice, *arrays)
 
 
@@ -48,7 +45,7 @@ def noisy(count: int, seed: int = 0) -> list[ArrayLayer]:
         z = rng.normal(0.0, 0.1, TILE.shape)
         z[rng.random(TILE.shape) < 0.2] = np.nan
         std = rng.uniform(0.05, 0.2, TILE.shape)
-        out.append(layer(k, z, std, rng.uniform(0, 0.3, TILE.shape), rng.uniform(0, 255, TILE.shape)))
+        out.append(layer(k, z, std, rng.uniform(0, 255, TILE.shape)))
     return out
 
 
@@ -57,13 +54,13 @@ def arrays(merged: Merged) -> list[np.ndarray]:
 
 
 def test_two_models_by_hand() -> None:
-    """Weights 1/0.1^2 = 100 and 1/0.1^2 / (1 + (0.2/0.1)^2) = 20: mean of 1.0 and 1.6 is 1.1."""
-    merged = merge([layer(0, 1.0), layer(4, 1.6, residual=0.2, ortho=200.0)], TILE, PARAMS)
-    np.testing.assert_allclose(merged.elevation, 1.1, rtol=1e-6)
-    np.testing.assert_allclose(merged.relief_std, 0.1 * np.hypot(100, 20) / 120, rtol=1e-6)
-    # shares 5/6 and 1/6 of models with equal sigma: fully alike their mean has that sigma
-    np.testing.assert_allclose(merged.elevation_std, 0.1 * np.sqrt(0.2 * (25 + 1) / 36 + 0.8), rtol=1e-6)
-    np.testing.assert_allclose(merged.spread, np.sqrt((100 * 0.1**2 + 20 * 0.5**2) / 120), rtol=1e-6)
+    """Weights 1/0.1^2 = 100 and 1/0.2^2 = 25: mean of 1.0 and 1.6 is 1.12."""
+    merged = merge([layer(0, 1.0), layer(4, 1.6, std=0.2, ortho=200.0)], TILE, PARAMS)
+    np.testing.assert_allclose(merged.elevation, 1.12, rtol=1e-6)
+    # Shares 4/5 and 1/5: relief 0.08 and 0.04; fully alike their mean has 0.12.
+    np.testing.assert_allclose(merged.relief_std, np.hypot(0.08, 0.04), rtol=1e-6)
+    np.testing.assert_allclose(merged.elevation_std, np.sqrt(0.2 * (0.08**2 + 0.04**2) + 0.8 * 0.12**2), rtol=1e-6)
+    np.testing.assert_allclose(merged.spread, np.sqrt(0.8 * 0.12**2 + 0.2 * 0.48**2), rtol=1e-6)
     assert (merged.count == 2).all()
     assert (merged.source == 0).all()
     np.testing.assert_allclose(merged.ortho, 100.0, atol=0.01)  # the best image, not a double exposure
@@ -71,11 +68,9 @@ def test_two_models_by_hand() -> None:
 
 def test_two_models_of_any_standard_deviations_by_the_equations() -> None:
     rng = np.random.default_rng(8)
-    z, std, residual, ortho = (
-        rng.uniform(*ends, (2, *TILE.shape)) for ends in ((0, 1), (0.05, 0.2), (0, 0.3), (9, 200))
-    )
-    merged = merge([layer(k, z[k], std[k], residual[k], ortho[k]) for k in range(2)], TILE, PARAMS)
-    weight = 1.0 / (std**2 * (1.0 + (residual / 0.1) ** 2))
+    z, std, ortho = (rng.uniform(*ends, (2, *TILE.shape)) for ends in ((0, 1), (0.05, 0.2), (9, 200)))
+    merged = merge([layer(k, z[k], std[k], ortho[k]) for k in range(2)], TILE, PARAMS)
+    weight = 1.0 / std**2
     share = weight / weight.sum(axis=0)
     mean = (share * z).sum(axis=0)
     alone, together = ((share * std) ** 2).sum(axis=0), (share * std).sum(axis=0) ** 2
@@ -246,7 +241,7 @@ def test_unsure_cells_are_left_undefined_on_request() -> None:
 def test_unusable_values_have_no_weight() -> None:
     bad = layer(1, 9.0)
     bad.elevation_std[0] = np.nan
-    bad.residual[1] = np.nan
+    bad.elevation_std[1] = 0.0
     bad.elevation[2] = np.nan
     bad.elevation_std[3] = np.inf
     merged = merge([layer(0, 1.0, ortho=50.0), bad], TILE, PARAMS)
@@ -272,7 +267,7 @@ def test_tiles_of_the_stage_equal_the_whole() -> None:
     dems, layers = [], []
     for k in range(4):
         lattice = Lattice.at(int(rng.integers(-20, 5)), int(rng.integers(5, 20)), 0.1, 25, 30)
-        names = ("elevation", "elevation_std", "residual", "ortho")
+        names = ("elevation", "elevation_std", "ortho")
         maps = {n: rng.uniform(0.05, 0.2, lattice.shape).astype(np.float32) for n in names}
         dems.append(Bundle(maps, {"lattice": lattice.to_dict(), "pair": 4 * k, "frame": "world"}))
         layers.append(ArrayLayer(4 * k, lattice, **maps))
@@ -294,7 +289,7 @@ def test_strips_of_any_height_give_the_same_bits(monkeypatch: pytest.MonkeyPatch
     tile = Lattice.at(0, 0, 0.1, 40, 30)
     rng = np.random.default_rng(5)
     layers = [
-        ArrayLayer(k, at, *(rng.uniform(0.05, 0.2, at.shape).astype(np.float32) for _ in range(4)))
+        ArrayLayer(k, at, *(rng.uniform(0.05, 0.2, at.shape).astype(np.float32) for _ in range(3)))
         for k, at in enumerate(Lattice.at(3 * k - 9, 4 * k - 12, 0.1, 25, 20) for k in range(7))
     ]
     whole = merge(layers, tile, PARAMS)
@@ -321,7 +316,7 @@ def test_of_a_stored_model_the_tile_alone_is_read() -> None:
             return Windows(self[name])
 
     lattice = Lattice.at(-500, 500, 0.1, 1000, 1000)
-    maps = {n: np.full(lattice.shape, 0.5, np.float32) for n in ("elevation", "elevation_std", "residual", "ortho")}
+    maps = {n: np.full(lattice.shape, 0.5, np.float32) for n in ("elevation", "elevation_std", "ortho")}
     dem = Bundle(Watched(maps), {"lattice": lattice.to_dict(), "pair": 4, "frame": "world"})
     merged = merge_stage.merge_stage.run(PARAMS, {"lattice": TILE.to_dict()}, {"dems": [dem]})
     assert Watched.cells == TILE.rows * TILE.cols
@@ -339,7 +334,7 @@ def test_the_footprint_is_the_ground_between_two_rays_a_pixel_apart() -> None:
 
 def test_cells_seen_from_afar_alone_are_left_out_on_request_and_what_is_vouched_for_stays() -> None:
     """A camera 1 m above the corner: at 0.01 rad a pixel covers 1.04 cm under 0.2 m of it, 1.17 cm at 0.41 m."""
-    names = ("elevation", "elevation_std", "residual", "ortho")
+    names = ("elevation", "elevation_std", "ortho")
     maps = {n: np.full(TILE.shape, 0.05, np.float32) for n in names}
     T = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.05]
     facts = {"lattice": TILE.to_dict(), "frame": "world"}
@@ -361,7 +356,7 @@ def test_cells_seen_from_afar_alone_are_left_out_on_request_and_what_is_vouched_
 def test_exposures_are_levelled_and_stay_grey_values() -> None:
     layers = [layer(0, 1.0, ortho=100.0), layer(4, 1.0, ortho=100.0), layer(8, np.nan)]
     bundles = [
-        Bundle({n: getattr(one, n) for n in ("elevation", "elevation_std", "residual", "ortho")},
+        Bundle({n: getattr(one, n) for n in ("elevation", "elevation_std", "ortho")},
                {"lattice": TILE.to_dict(), "pair": one.pair})
         for one in layers
     ]  # fmt: skip

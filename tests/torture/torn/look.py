@@ -7,10 +7,10 @@ import zipfile
 from contextlib import suppress
 from pathlib import Path
 
-from rille.pipeline.engine.store.archive import BrokenError
+from rille.pipeline.engine.store.arrays import array_digests, output_digest
+from rille.pipeline.engine.store.artifact import BrokenError
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import artifacts
-from rille.pipeline.engine.store.output_digest import array_digests, output_digest
 
 HERE = Path(__file__).parent.parent
 PLACES = [str(HERE), str(HERE.parent / "pipeline"), str(HERE.parent.parent)]

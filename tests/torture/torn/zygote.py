@@ -16,8 +16,8 @@ import zarr
 import zarr.codecs
 import zarr.storage  # noqa: F401
 
-import rille.pipeline.engine.code_digest
 import rille.pipeline.engine.events
+import rille.pipeline.engine.keys
 import rille.pipeline.engine.run
 import rille.pipeline.engine.store.maintenance
 import torn.saboteur  # noqa: F401
@@ -56,7 +56,7 @@ def _child(line, alone):
 
 def main():
     """Say the process id, wait for its end, say how it ended."""
-    rille.pipeline.engine.code_digest.tree_digest()  # reads all sources, once for all
+    rille.pipeline.engine.keys.tree_digest()  # reads all sources, once for all
     for line in sys.stdin:
         seen, alone = os.pipe()
         pid = os.fork()
