@@ -258,14 +258,14 @@ def _beside(topic: str) -> str:
 
 
 def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
-    """Fields of the ``camera_info`` of an image topic; messages of uncalibrated cameras, with P = 0, do not count.
+    """Fields of the ``camera_info`` of an image topic; messages of uncalibrated cameras, with P or K = 0, do not count.
 
     ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     """
     first: dict[str, Any] | None = None
     for _, _, m in _messages(reader, _beside(topic)):
         info = {key.lower(): getattr(m, key) for key in m.__dataclass_fields__ if key != "header"}
-        if not np.any(info["p"]):
+        if not np.any(info["p"]) or not (np.any(info["k"]) or RECTIFIED.search(topic)):
             continue
         first = first or info
         if changed := [key for key, value in info.items() if not np.array_equal(value, first[key])]:

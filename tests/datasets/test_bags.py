@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import resource
 import sys
+from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import rille
+from rille.datasets import bags
 from rille.datasets.bags import is_bag
 from rille.datasets.images import bag as bag_images
 from rille.datasets.registry import open_sequence
@@ -424,6 +427,18 @@ distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
 rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
 projection_matrix: {{rows: 3, cols: 4, data: [70, 0, 31, {tx}, 0, 70, 24, 0, 0, 0, 1, 0]}}
 """
+
+
+@dataclass
+class Info:
+    k: list[float]
+    p: list[float]
+
+
+@pytest.mark.parametrize(("topic", "counts"), [("/left/image_raw", False), ("/left/image_rect", True)])
+def test_camera_info_without_K_is_that_of_rectified_images_alone(monkeypatch, topic, counts):
+    monkeypatch.setattr(bags, "_messages", lambda *_: [(0, b"", Info([0.0] * 9, P))])
+    assert (bags._info(None, Path(), topic) is not None) == counts
 
 
 @pytest.mark.parametrize("form", FORMS)
