@@ -65,7 +65,9 @@ def rig_of(
     # 1e-6: below, in any usual unit of length, both cameras stand in one place.
     if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
-        raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
+        raise InputError(
+            "RIL-129", text, remedy="give rig.baseline (m) in a manifest, or the calibration of both cameras"
+        )
     distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
     return rig, distorted or None
 

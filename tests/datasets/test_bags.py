@@ -485,6 +485,22 @@ def test_a_manifest_leaves_the_cameras_of_a_bag_as_they_are(tmp_path):
         open_sequence(str(path))
     path.write_text(path.read_text() + "tolerance = 0.02\n")
     assert open_sequence(str(path)).rig.baseline == pytest.approx(0.5)
+    path.write_text(path.read_text() + "[rig]\nbaseline = 0.4\n")
+    moved = open_sequence(str(path))
+    assert (moved.rig.baseline, moved.rig.left.fx) == (pytest.approx(0.4), 50)
+    assert any("RIL-693" in line for line in moved.warnings)
+
+
+def test_cameras_of_a_bag_that_were_calibrated_alone_are_a_rig_with_the_baseline_of_a_manifest(tmp_path):
+    bag = street(infos=False)
+    for side in ("left", "right"):
+        bag.info(f"/stereo/{side}/camera_info", (64, 48), P)
+    path = bag.write(tmp_path)
+    with raises("RIL-129", "rig.baseline"):
+        open_sequence(str(path))
+    manifest = tmp_path / "m.rille.toml"
+    manifest.write_text(f'[images]\nleft = "{path}"\nright = "{path}"\n[rig]\nbaseline = 0.4\n')
+    assert open_sequence(str(manifest)).rig.baseline == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("filters", ["rggb", "bggr", "gbrg", "grbg"])
