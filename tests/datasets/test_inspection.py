@@ -378,6 +378,17 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration.sizes == ((960, 600), (960, 600))
 
 
+def test_scenes_of_two_numbered_cameras_are_sequences_of_their_own(tmp_path):
+    """As of Booster."""
+    scenes = ("bridge", "cellar", "alley")
+    write_images(
+        tmp_path, [f"{scene}/camera_{side}/im{k}.png" for scene in scenes for side in ("00", "02") for k in range(3)]
+    )
+    found = inspect(tmp_path)
+    assert (found.views.left, found.views.pairs, found.views.trouble) == ("alley/camera_00/im*.png", 3, "")
+    assert any(f"rille init {tmp_path}/bridge" in line for line in found.unread), found.unread
+
+
 def test_calibrations_numbered_as_the_cameras_are_a_pair(tmp_path):
     write_images(tmp_path, [f"cam{side}/{k}.png" for side in (0, 1) for k in range(3)])
     for k in (0, 1):
