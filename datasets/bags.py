@@ -31,7 +31,7 @@ from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
 from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
 from rille.datasets.inspection.views import FoundImages
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
-from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, read_optics, unusual_cameras
+from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, placed, read_optics, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -51,6 +51,7 @@ FORMS = (
 SUFFIXES = (".bag", ".mcap", ".db3")
 INFO, IMU, ODOMETRY = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 FRAMES = "/tf_static"
+UNSTATED = RigSection()
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def open_bag(
     topics: str | None = None,
     optics_of: Callable[[Sizes], Optics] | None = None,
     tolerance: float | None = None,
+    rig: RigSection = UNSTATED,
 ) -> Sequence:
     """The sequence of a bag.
 
@@ -100,6 +102,7 @@ def open_bag(
     optics_of : returns the cameras of images of some sizes; by default those of ``camera_info``, or else of a
         calibration file beside the bag.
     tolerance : s; largest difference of the stamps of a pair; None: see :func:`rille.datasets.images.pairing.join`.
+    rig : baseline or pose of the right camera where ``optics_of`` is not given.
     """
     with bag.opened(path) as reader:
         chosen = _topics(reader, path, topics)
@@ -113,7 +116,7 @@ def open_bag(
                 check_size(one.size, taken[camera][0].size, f"image {stamp} of {topic} in {path}")
         times = seconds(stamps, str(path), unit="ns")
         frame = taken["left"][0].frame
-        optics, turned = (optics_of(sizes), np.eye(3)) if optics_of else _optics(reader, path, chosen, sizes)
+        optics, turned = (optics_of(sizes), np.eye(3)) if optics_of else _optics(reader, path, chosen, sizes, rig)
         inertial, odometry, unused = _movement(reader, path, times, frame, turned)
 
     def image(number: int, camera: str) -> Source:
@@ -226,7 +229,9 @@ def _joined(
 # -- cameras -----------------------------------------------------------------------------------------------------------
 
 
-def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> tuple[Optics, Floats]:
+def _optics(
+    reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes, section: RigSection
+) -> tuple[Optics, Floats]:
     """Cameras of the image topics, and the rotation from the left camera's frame to that of its images."""
     infos = [_info(reader, path, topic) for topic in topics]
     missing = next((_beside(topic) for topic, info in zip(topics, infos, strict=True) if info is None), None)
@@ -240,16 +245,17 @@ def _optics(reader: Any, path: Path, topics: tuple[str, str], sizes: Sizes) -> t
             raise InputError("RIL-949", text, remedy=remedy)
         stated = dict(zip(CAMERAS if beside.files[1:] else ("file",), beside.files, strict=True))
         cameras = Cameras.model_validate({**stated, "names": beside.names})
-        manifest = Manifest(images=Images(left="", right=""), cameras=cameras)
+        manifest = Manifest(images=Images(left="", right=""), cameras=cameras, rig=section)
         line = warning("RIL-825", f"{path} has no {missing}: its cameras are those of {' and '.join(beside.files)}")
         with within(str(path)):
             optics = read_optics(manifest, path.parent, sizes)
         return replace(optics, warnings=(line, *optics.warnings)), np.eye(3)
     (left, turned), (right, _) = (_camera(path, topic, info) for topic, info in zip(topics, infos, strict=True) if info)
-    rig, lenses = rig_of(left, right, sizes)
     with within(str(path)):
-        doubts = check_baseline(rig.baseline, RigSection())
-    return Optics(rig, lenses, None, (*doubts, *unusual_cameras((left, right), sizes))), turned
+        left, right, lines = placed(left, right, section)
+        rig, lenses = rig_of(left, right, sizes)
+        lines += check_baseline(rig.baseline, section)
+    return Optics(rig, lenses, None, (*lines, *unusual_cameras((left, right), sizes))), turned
 
 
 def _beside(topic: str) -> str:
@@ -258,14 +264,14 @@ def _beside(topic: str) -> str:
 
 
 def _info(reader: Any, path: Path, topic: str) -> dict[str, Any] | None:
-    """Fields of the ``camera_info`` of an image topic; messages of uncalibrated cameras, with P = 0, do not count.
+    """Fields of the ``camera_info`` of an image topic; messages of uncalibrated cameras, with P or K = 0, do not count.
 
     ROS 1 names the fields K, D, R and P, ROS 2 k, d, r and p.
     """
     first: dict[str, Any] | None = None
     for _, _, m in _messages(reader, _beside(topic)):
         info = {key.lower(): getattr(m, key) for key in m.__dataclass_fields__ if key != "header"}
-        if not np.any(info["p"]):
+        if not np.any(info["p"]) or not (np.any(info["k"]) or RECTIFIED.search(topic)):
             continue
         first = first or info
         if changed := [key for key, value in info.items() if not np.array_equal(value, first[key])]:

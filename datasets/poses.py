@@ -51,6 +51,9 @@ IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 STAMP = re.compile(r"\d{16,}")
 """Time of EuRoC, nanoseconds; programs that write seconds have other orders of columns."""
 
+GPS_EPOCH = 315964782
+"""s from 1970 to 1980, where GPS time begins, less its 18 leap seconds since."""
+
 WITHIN = 1e-6
 """s; times that differ by less are equal."""
 
@@ -443,8 +446,13 @@ def refuse_apart(times: Sequence[float] | Floats, at: Sequence[float] | Floats, 
     """Refuse a record called ``name`` whose increasing times, s, have none in common with those of the frames."""
     if at[-1] < times[0] - WITHIN or at[0] > times[-1] + WITHIN:
         text = f"{name} reaches from {times[0]:.3f} to {times[-1]:.3f} s, the frames from {at[0]:.3f} to {at[-1]:.3f} s"
+        later = float(at[0] - times[0])
+        zone = round(later / 1800) * 1800
+        offset, of = (zone, "of another time zone") if abs(zone) <= 14 * 3600 else (GPS_EPOCH, "since 1980 (GPS time)")
+        # 300 s: records begin that long before the images.
+        likely = f"are they {of}? Then time_offset = {offset}; else " if offset and abs(later - offset) < 300 else ""
         remedy = "check that both have the same clock and unit; a manifest states a constant offset as time_offset"
-        raise InputError("RIL-269", f"{text}: no common time", remedy=remedy)
+        raise InputError("RIL-269", f"{text}: no common time", remedy=likely + remedy)
 
 
 def coverage(found: Sequence[object | None], at: Sequence[float], what: str) -> tuple[str, ...]:

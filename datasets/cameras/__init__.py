@@ -25,7 +25,7 @@ __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
     "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
-    "camodocal, VINS, Basalt, mrcal, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
+    "camodocal, VINS, Basalt, mrcal, DSO, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
     "COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) "
     "are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's "
     "K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
@@ -47,6 +47,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
     (lambda text: f"{makers.MRPT}]" in text, makers.mrpt),
+    (lambda text: slam.DSO.search(text) is not None, slam.dso),
     (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
     (lambda text: "[image]" in text and states(r"camera matrix[ \t]*$")(text), opencv.ost),

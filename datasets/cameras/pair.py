@@ -65,7 +65,9 @@ def rig_of(
     # 1e-6: below, in any usual unit of length, both cameras stand in one place.
     if rig.baseline < 1e-6:
         text = f"cameras {left.name} and {right.name} stand in one place: the baseline is 0 m"
-        raise InputError("RIL-129", text, remedy="give the baseline in metres, or the calibration of both cameras")
+        raise InputError(
+            "RIL-129", text, remedy="give rig.baseline (m) in a manifest, or the calibration of both cameras"
+        )
     distorted = {side: lens for side, lens in lenses.items() if not lens.ideal}
     return rig, distorted or None
 
@@ -103,14 +105,15 @@ def _check_axes(camera: CalibratedCamera, width: int, height: int) -> None:
 def _sized(camera: CalibratedCamera, size: tuple[int, int] | None) -> Lens:
     c = camera.lens.camera
     if camera.size is not None and size is not None and camera.size != size:
-        (width, height), scale = camera.size, size[0] / camera.size[0]
+        (width, height), x = camera.size, size[0] / camera.size[0]
+        y = size[1] / height
         remedy = "give the images as they were calibrated, or the calibration of images of this size"
         if camera.size == size[::-1]:
             remedy += " (turned by their tag: magick mogrify -auto-orient FILES; or its width and height are exchanged)"
-        elif height * scale == size[1] and camera.lens.model != "cahvore":  # whose skew is in pixels, too
+        elif abs(height * x - size[1]) < 1 and camera.lens.model != "cahvore":  # whose skew is in pixels, too
             # The centre of the first pixel is at 0, and its corner stays in place.
-            cx, cy = (scale * (v + 0.5) - 0.5 for v in (c.cx, c.cy))
-            focal = f"fx = {c.fx * scale:.8g}, fy = {c.fy * scale:.8g}"
+            cx, cy = x * (c.cx + 0.5) - 0.5, y * (c.cy + 0.5) - 0.5
+            focal = f"fx = {c.fx * x:.8g}, fy = {c.fy * y:.8g}"
             remedy += f"; if they were scaled, it has {focal}, cx = {cx:.8g}, cy = {cy:.8g} and the same distortion"
         text = f"camera {camera.name} is calibrated for {width} x {height} pixels, the images are {size[0]} x {size[1]}"
         raise InputError("RIL-131", text, remedy=remedy)

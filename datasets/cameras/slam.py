@@ -1,4 +1,4 @@
-"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt and mrcal."""
+"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, mrcal, DSO."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields, by_count, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.images.pairing import natural
+from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -131,6 +132,26 @@ def dsec(f: Fields, path: Path) -> list[CalibratedCamera]:
     return found
 
 
+DSO = re.compile(
+    r"^(Pinhole|RadTan|EquiDistant|KannalaBrandt)((?:[ \t]+[-+.\deE]{1,40}){5,8})\s*^(\d+)[ \t]+(\d+)", re.M
+)
+"""Beginning of a calibration of DSO and 4Seasons: model with fx, fy, cx, cy and coefficients; width and height."""
+
+
+def dso(text: str, path: Path) -> list[CalibratedCamera]:
+    """The camera of ``calib_0.txt`` or ``calib_1.txt``; ``calib_stereo.txt`` beside them has T_right_left, metres."""
+    model, numbers, *size = DSO.findall(text)[0]
+    stated = {"intrinsics": numbers.split()[:4], "distortion_coeffs": numbers.split()[4:], "resolution": size}
+    f = Fields(stated, str(path))
+    bent = any(f.numbers("distortion_coeffs"))
+    f.values |= {"distortion_model": model} if bent else {"distortion_coeffs": []}
+    stereo, T = path.with_name(re.sub(r"_[01]\.", "_stereo.", path.name)), None
+    if stereo != path and stereo.is_file():
+        rig = Fields({"T_right_left": read_text(stereo, "calibration").split()}, str(stereo))
+        T = rig.pose("T_right_left") if "_1." in path.name else RigidTransform.identity()
+    return [CalibratedCamera(path.stem, _pinhole_lens(f, "distortion_coeffs"), T)]
+
+
 def mrcal(text: str, path: Path) -> list[CalibratedCamera]:
     """The camera of a ``.cameramodel``; ``extrinsics``: rotation vector and t, x_camera = R x_reference + t, metres."""
     f = Fields({key: word or row.replace(",", " ").split() for key, word, row in MRCAL.findall(text)}, str(path))
@@ -158,7 +179,10 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
         raise f.error("RIL-135", "camera_model", f"= {kind!r} is not read", remedy)
     key = f.spelt(("intrinsics", "camera_matrix"))  # the latter of DSEC
     fx, fy, cx, cy = f.numbers(key, 4)
-    return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), f.size("resolution")))
+    if "sensor_type" in f and "resolution" not in f:
+        fy, cx = cx, fy  # OpenLORIS lists fx, cx, fy, cy
+    size = f.size("resolution") if "resolution" in f else f.size("width", "height")
+    return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), size))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:

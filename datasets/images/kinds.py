@@ -36,7 +36,7 @@ KINDS: dict[str, tuple[str, str]] = {
         " FILES; of a table write text: numpy.savetxt",
     ),
     "matrix file": (
-        ".npz .mat .pkl .pickle",
+        ".npz .mat .pkl .pickle .feather .parquet .h5",
         "if it is the calibration, write it as text: w = cv2.FileStorage('stereo.yml', 1), w.write('K1', K1), and so "
         "D1, K2, D2, R, T (MATLAB's K and R transposed)",
     ),

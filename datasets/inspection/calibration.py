@@ -95,8 +95,10 @@ def find_calibration(folder: Path, texts: list[Path], views: FoundImages) -> Cal
 
 
 def _of_other_side(name: str, sides: tuple[str, str]) -> str:
-    """The name of a file of the left camera with the right one's word in the place of its own; else as it is."""
-    return "".join(sides[1] if word == sides[0] else word for word in re.split(r"([^\W_]+)", name))
+    """The name of a file of the left camera with the right one's word or number in the place of its own; else as is."""
+    left, right = (re.sub(r"\D", "", side) for side in sides)
+    words = {sides[0]: sides[1]} | ({left: right} if left and right else {})
+    return "".join(words.get(word, word) for word in re.split(r"([^\W_]+)", name))
 
 
 def _calibration(files: tuple[str, ...], cameras: list[CalibratedCamera], sides: tuple[str, str]) -> FoundCalibration:

@@ -53,28 +53,32 @@ def table_kind(path: Path, pairs: int) -> str:
         return "imu"
     if "yaw" in header and "roll" in header and not (table.crs or of_photographs(table)):
         return "attitude"
+    meant, poses = meanings(table), "truth"
     # Of a robot on a plane, or by their name: dead reckoning is no truth.
-    wheels = ODOMETRY.search(path.stem) is not None and not TRUTH.search(path.stem)
-    places = [row[k] for name, k in meanings(table).items() if name in ("x", "y")]
-    if len(places) == 2 and (wheels or "yaw" in meanings(table)):
-        # Dead reckoning begins near 0, in a frame of its own.
-        geodetic = table.crs or of_photographs(table) or np.abs(places).max() > 1e4
-        return "positions" if geodetic else "odometry"
+    if (ODOMETRY.search(path.stem) and not TRUTH.search(path.stem)) or "yaw" in meant:
+        # It begins near 0, in a frame of its own.
+        places = [row[meant[axis]] for axis in ("x", "y") if axis in meant]
+        geodetic = table.crs or of_photographs(table) or np.abs(places).max(initial=0.0) > 1e4
+        poses = "positions" if geodetic else "odometry"
+        if len(places) == 2:
+            return poses
     if untimed(table) and len(table.rows) == pairs:
-        return "truth"
-    if matrix_at(table) is not None or (meanings(table).keys() >= {"x", "y", *QUATERNION} and not table.crs):
+        return poses
+    if matrix_at(table) is not None or (meant.keys() >= {"x", "y", *QUATERNION} and not table.crs):
         # Of cameras or sensors, as "image_00: ...", or a single one, it says where they are mounted.
-        mounts = table.rows[0][0].endswith(":") or (len(table.rows) == 1 < pairs and "time" not in meanings(table))
-        return "" if mounts else "truth"
-    positions = positions_of(table, "csv", {}) if meanings(table).keys() >= {"x", "y"} else None
+        mounts = table.rows[0][0].endswith(":") or (len(table.rows) == 1 < pairs and "time" not in meant)
+        return "" if mounts else poses
+    # Of degrees that are no decimal ones the error says how to write them.
+    placed = meant.keys() >= {"x", "y"} or meant.keys() >= {"lat", "lon"}
+    positions = positions_of(table, "csv", {}) if placed else None
     # Without times or names of images there must be one for each pair.
     if positions is not None and (positions.times or positions.images or len(positions.positions) == pairs):
         return "positions"
     images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
-    if images and "time" in meanings(table) and len(table.rows) == pairs:
+    if images and "time" in meant and len(table.rows) == pairs:
         return "times"
     if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
-        return "truth"
+        return poses
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
     rising = row.size == 1 and len(table.rows) == pairs and bool((np.diff(table.values([0]), axis=0) > 0).all())
     if (rising and not CAMERA_WORDS.search(path.stem)) or (row.size <= 3 and named):

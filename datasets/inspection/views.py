@@ -139,7 +139,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         both, parts, counts = _sets(folder, images)
     if parts:
         first, second = parts
-        both, tokens = {(0, ""): (parts[first], parts[second])}, ((first, second),)
+        both, tokens = _by_place(folder, parts), ((first, second),)
         taken = f"{first!r} and {second!r} are taken for the left and the right camera"
         lines.append(f"{taken}, in order of their names: `rille check` shows if they are not")
     if not both:
@@ -182,6 +182,18 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         tuple(lines),
         (*others, *([f"{count(len(alone), 'image')} ({alone[0]} ...): of neither camera by name"] if alone else ())),
     )
+
+
+def _by_place(folder: Path, parts: dict[str, list[Path]]) -> Sets:
+    """Images by camera, a set for each folder without the words of cameras, unless each has one frame, or one side."""
+    places: Sets = defaultdict(lambda: ([], []))
+    for side, images in enumerate(parts.values()):
+        for path in images:
+            words = re.split(r"([^\W_]+)", relative(path.parent, folder))
+            places[0, "".join("*" if word in parts else word for word in words)][side].append(path)
+    left, right = parts.values()
+    apart = all(map(all, places.values())) and any(min(map(len, of)) > 1 for of in places.values())
+    return places if apart else {(0, ""): (left, right)}
 
 
 def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: Path) -> str:

@@ -20,7 +20,7 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.pairing import ImagePair, common_headers, pair_up, writable
-from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, RigSection, read_manifest
+from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, read_manifest
 from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
@@ -135,11 +135,11 @@ def _of_bag(manifest: Manifest, root: Path) -> tuple[Sequence, tuple[ImagePair, 
     (path, _, left), (other, _, right) = (text.partition(":") for text in (manifest.images.left, manifest.images.right))
     if path != other or not is_bag(root / path):
         return None
-    stated = manifest.cameras != Cameras() or manifest.rig != RigSection()
+    stated = manifest.cameras != Cameras() or manifest.rig.file is not None
     topics = f"{left},{right}" if left and right else None
     rectified = _are_rectified(manifest.images, (left, right))
     optics_of = (lambda sizes: read_optics(manifest, root, sizes, rectified)) if stated else None
-    sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance)
+    sequence = open_bag((root / path).resolve(), topics, optics_of, manifest.images.tolerance, manifest.rig)
     return sequence, tuple(ImagePair(stamp, Path(stamp), Path(stamp)) for stamp in sequence.frame_names)
 
 

@@ -68,7 +68,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     above = manifest.world.up
     up = None if above is None else direction(above, left.T_camera_reference)
     pinned = None if manifest.rig.file is None else _pinned(root / manifest.rig.file)
-    left, right, lines = _placed(left, right, manifest.rig, pinned)
+    left, right, lines = placed(left, right, manifest.rig, pinned)
     rig, lenses = rig_of(left, right, sizes)
     if pinned is not None and (pinned.left, pinned.right) != (rig.left, rig.right):
         text = f"rig.file: {manifest.rig.file} was estimated with other cameras, or images of another size"
@@ -161,8 +161,8 @@ def direction(stated: Vector, T_camera_reference: RigidTransform | None) -> Vect
     return stated if T_camera_reference is None else vector_of(T_camera_reference.rotation @ stated)
 
 
-def _placed(
-    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None
+def placed(
+    left: CalibratedCamera, right: CalibratedCamera, section: RigSection, pinned: Rig | None = None
 ) -> tuple[CalibratedCamera, CalibratedCamera, list[str]]:
     """Both cameras with poses in the left camera's frame, by the manifest, else by the files; and warnings."""
     of_files = relative_pose(left, right)
@@ -179,8 +179,7 @@ def _placed(
         if theirs > 0 and abs(ours - theirs) > 0.01 * theirs:
             text = f"baseline {ours:g} m of the manifest is used; the calibration file says {theirs:g} m"
             lines.append(warning("RIL-693", text))
-    placed = replace(left, T_camera_reference=RigidTransform.identity())
-    return placed, replace(right, T_camera_reference=chosen), lines
+    return replace(left, T_camera_reference=RigidTransform.identity()), replace(right, T_camera_reference=chosen), lines
 
 
 def _pinned(path: Path) -> Rig:

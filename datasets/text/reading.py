@@ -43,7 +43,7 @@ MOST_ENTRIES = 300_000
 GREATEST = 1e20
 """Above any measurement in any unit; smaller numbers stay finite when squared and multiplied."""
 
-BETWEEN = re.compile(r'[\s;:=\[\]()"]+|,\s')
+BETWEEN = re.compile(r'[\s;=\[\]()"]+|[,:]\s')
 COMMA, POINT = re.compile(r"[-+]?(\d+),(\d+)([eE][-+]?\d+)?"), re.compile(r"\d\.\d")
 """What stands between numbers, and numbers with a decimal comma and with a point."""
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import resource
 import sys
+from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import rille
+from rille.datasets import bags
 from rille.datasets.bags import is_bag
 from rille.datasets.images import bag as bag_images
 from rille.datasets.registry import open_sequence
@@ -426,6 +429,18 @@ projection_matrix: {{rows: 3, cols: 4, data: [70, 0, 31, {tx}, 0, 70, 24, 0, 0, 
 """
 
 
+@dataclass
+class Info:
+    k: list[float]
+    p: list[float]
+
+
+@pytest.mark.parametrize(("topic", "counts"), [("/left/image_raw", False), ("/left/image_rect", True)])
+def test_camera_info_without_K_is_that_of_rectified_images_alone(monkeypatch, topic, counts):
+    monkeypatch.setattr(bags, "_messages", lambda *_: [(0, b"", Info([0.0] * 9, P))])
+    assert (bags._info(None, Path(), topic) is not None) == counts
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("right", [None, [0.0] * 12])  # none at all, or of a camera that is not calibrated
 def test_a_calibration_file_beside_a_bag_stands_for_its_camera_info(tmp_path, form, right):
@@ -470,6 +485,22 @@ def test_a_manifest_leaves_the_cameras_of_a_bag_as_they_are(tmp_path):
         open_sequence(str(path))
     path.write_text(path.read_text() + "tolerance = 0.02\n")
     assert open_sequence(str(path)).rig.baseline == pytest.approx(0.5)
+    path.write_text(path.read_text() + "[rig]\nbaseline = 0.4\n")
+    moved = open_sequence(str(path))
+    assert (moved.rig.baseline, moved.rig.left.fx) == (pytest.approx(0.4), 50)
+    assert any("RIL-693" in line for line in moved.warnings)
+
+
+def test_cameras_of_a_bag_that_were_calibrated_alone_are_a_rig_with_the_baseline_of_a_manifest(tmp_path):
+    bag = street(infos=False)
+    for side in ("left", "right"):
+        bag.info(f"/stereo/{side}/camera_info", (64, 48), P)
+    path = bag.write(tmp_path)
+    with raises("RIL-129", "rig.baseline"):
+        open_sequence(str(path))
+    manifest = tmp_path / "m.rille.toml"
+    manifest.write_text(f'[images]\nleft = "{path}"\nright = "{path}"\n[rig]\nbaseline = 0.4\n')
+    assert open_sequence(str(manifest)).rig.baseline == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("filters", ["rggb", "bggr", "gbrg", "grbg"])

@@ -7,6 +7,7 @@ import pytest
 from raising import raises
 
 from rille.datasets.cameras import UNKNOWN_SIZE, CalibratedCamera, read_cameras, rig_of
+from rille.datasets.cameras.model import relative_pose
 from rille.stages.geometry.geometry import Camera, RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
 
@@ -1102,6 +1103,35 @@ def test_one_line_that_names_file_and_key(tmp_path, text, expected):
 
 
 # -- as cameras come with them -----------------------------------------------------------------------------------------
+
+
+def test_calibrations_of_4seasons(tmp_path):
+    text = "{} 501.47 501.48 421.79 167.65 {}\n800 400\ncrop\n800 400\n"
+    pose = np.eye(4)
+    pose[0, 3] = -0.3005
+    (tmp_path / "undistorted_calib_stereo.txt").write_text("\n".join(" ".join(map(str, row)) for row in pose))
+    left, right = (
+        read_cameras(written(tmp_path, text.format("Pinhole", "0.0 0.0 0.0 0.0"), f"undistorted_calib_{k}.txt"))[0]
+        for k in (0, 1)
+    )
+    assert left.lens == Lens(Camera(501.47, 501.48, 421.79, 167.65, 800, 400))
+    np.testing.assert_allclose(centre(relative_pose(left, right)), [0.3005, 0, 0], atol=1e-12)
+    (bent,) = read_cameras(written(tmp_path, text.format("EquiDistant", "-0.01 0.02 0.003 0.0004"), "calib_0.txt"))
+    assert (bent.lens.model, bent.lens.coefficients) == ("fisheye", (-0.01, 0.02, 0.003, 0.0004))
+    assert bent.T_camera_reference is None
+    with raises("RIL-370", "calib_1.txt: distortion_coeffs"):
+        read_cameras(written(tmp_path, text.format("Pinhole", "0.93"), "calib_1.txt"))
+
+
+def test_openloris_lists_columns_before_rows(tmp_path):
+    part = "{}:\n  sensor_type: camera\n  width: 848\n  height: 480\n  model: pinhole\n"
+    part += (
+        "  intrinsics: !!opencv-matrix\n    rows: 1\n    cols: 4\n    dt: d\n    data: [611.4, 433.2, 611.5, 249.5]\n"
+    )
+    names = "d400_color_optical_frame", "d400_depth_optical_frame"
+    cameras = read_cameras(written(tmp_path, "%YAML:1.0\n" + "".join(map(part.format, names)), "sensors.yaml"))
+    assert [camera.lens.camera for camera in cameras] == [Camera(611.4, 611.5, 433.2, 249.5, 848, 480)] * 2
+
 
 ZED = """[LEFT_CAM_{0}]
 fx={f}

@@ -287,6 +287,18 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
 def test_dead_reckoning_is_no_truth(tmp_path, name, kind):
     write_lines(tmp_path / name, ["# time x y z qx qy qz qw", *(f"{k} {k} 0 0 0 0 0.6 0.8" for k in range(3))])
     assert table_kind(tmp_path / name, 2) == kind
+    for rows in (["{} 1 0 0 0 0.6 0 0.8"], ["1 0 0 {} 0 1 0 0 0 0 1 0"]):
+        write_lines(tmp_path / name, [row.format(k) for row in rows for k in range(3)])
+        assert table_kind(tmp_path / name, 3) == kind, "without names of columns, too"
+
+
+@pytest.mark.parametrize(
+    "place", ["48\N{DEGREE SIGN} 6.000000' N,11\N{DEGREE SIGN} 30.0' E", "4806.0,1130.0", "48:06:00,11:30:00"]
+)
+def test_degrees_and_minutes_are_told_with_what_to_write_instead(tmp_path, place):
+    write_lines(tmp_path / "gnss.csv", ["time,latitude,longitude,altitude", *(f"{k},{place},500" for k in range(3))])
+    with raises("RIL-805", "decimal degrees", "(neither minutes"):
+        table_kind(tmp_path / "gnss.csv", 3)
 
 
 @pytest.mark.parametrize("row", ["{0:05d} {1}.5 8.0", "{1}500000000 {1}.5", "{1}.5"])
@@ -364,6 +376,29 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration is not None
     assert (found.calibration.files, found.calibration.cameras) == (("SN1.conf",), 2)
     assert found.calibration.sizes == ((960, 600), (960, 600))
+
+
+def test_scenes_of_two_numbered_cameras_are_sequences_of_their_own(tmp_path):
+    """As of Booster."""
+    scenes = ("bridge", "cellar", "alley")
+    write_images(
+        tmp_path, [f"{scene}/camera_{side}/im{k}.png" for scene in scenes for side in ("00", "02") for k in range(3)]
+    )
+    found = inspect(tmp_path)
+    assert (found.views.left, found.views.pairs, found.views.trouble) == ("alley/camera_00/im*.png", 3, "")
+    assert any(f"rille init {tmp_path}/bridge" in line for line in found.unread), found.unread
+
+
+def test_calibrations_numbered_as_the_cameras_are_a_pair(tmp_path):
+    write_images(tmp_path, [f"cam{side}/{k}.png" for side in (0, 1) for k in range(3)])
+    for k in (0, 1):
+        text = f"Pinhole 50 50 31 23 0.0\n{SIZE[0]} {SIZE[1]}\ncrop\n{SIZE[0]} {SIZE[1]}\n"
+        (tmp_path / f"undistorted_calib_{k}.txt").write_text(text)
+    (tmp_path / "undistorted_calib_stereo.txt").write_text("1 0 0 -0.3\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    found = inspect(tmp_path).calibration
+    assert found is not None
+    assert found.files == ("undistorted_calib_0.txt", "undistorted_calib_1.txt")
+    assert found.baseline == pytest.approx(0.3)
 
 
 def test_of_several_sets_the_plainest_is_taken_and_the_others_are_told(tmp_path):

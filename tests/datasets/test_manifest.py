@@ -845,6 +845,8 @@ def test_images_of_another_scale_than_that_of_the_calibration_are_refused_and_th
         opened(write_sequence(tmp_path, cameras=of_twice_the_size))
     with raises("RIL-131", "fx = 60, fy = 60, cx = 31.5, cy = 23.5"):
         opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 128\nheight = 96\n"))
+    with raises("RIL-131", "if they were scaled, it has fx = 60, fy = 60.631579"):  # a row was left over
+        opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 128\nheight = 95\n"))
     # It is the images' own: stated as such, or with a lens off the middle of one side.
     assert opened(write_sequence(tmp_path, cameras=of_twice_the_size + "width = 64\nheight = 48\n")).warnings
     assert opened(write_sequence(tmp_path, cameras="[cameras]\nfx = 60.0\ncx = 63.5\ncy = 23.5\n")).warnings

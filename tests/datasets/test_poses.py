@@ -10,7 +10,7 @@ from raising import raises
 from scipy.spatial.transform import Rotation
 
 from rille.datasets.inspection.tables import table_kind
-from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion
+from rille.datasets.poses import TimedPoses, coverage, interpolate, poses_of, positions_of, read_motion, refuse_apart
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -255,6 +255,21 @@ def test_gaps_and_ends_have_no_pose():
         "RIL-688: no truth for 4 of 10 frames, in 3 stretches: first at 0.00 s, last at 5.20 s of the sequence",
     )
     assert coverage(found[1:4], at[1:4], "truth") == ()
+
+
+@pytest.mark.parametrize(
+    ("later", "hint"),
+    [
+        (7200.5, "of another time zone? Then time_offset = 7200;"),
+        (-19790.0, "of another time zone? Then time_offset = -19800;"),
+        (315964782.4, "since 1980 (GPS time)? Then time_offset = 315964782;"),
+        (250.0, "check that both"),
+        (6000.0, "check that both"),
+    ],
+)
+def test_of_clocks_that_differ_as_known_ones_do_the_offset_is_named(later, hint):
+    with raises("RIL-269", hint):
+        refuse_apart([1e9, 1e9 + 5], [1e9 + later, 1e9 + later + 5], "gnss.csv")
 
 
 def test_no_common_time_names_both_ranges():
