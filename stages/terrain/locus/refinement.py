@@ -30,9 +30,9 @@ from 1000 to 4000."""
 MAX_BEND_PX = 0.05
 """Second difference [pixels of disparity] beyond which stiffness gives way to an edge."""
 
-MEAN_SIDE_CELLS = 31
-"""Side [cells] of the window of the local mean; brightness varies more slowly: with uneven brightness a wider one errs
-more, in even one a narrower one."""
+MEAN_SIDE_CELLS = 15
+"""Side [cells] of the window of the local mean; brightness varies more slowly. Over 31 cells RMS errors are 2 to 3 %
+smaller, but small stones are lower: paths over four beds cross 70 instead of 29 cells that are truly hazardous."""
 
 
 def refine(views: SurfaceViews, lattice: Lattice, elevation: Floats32, steps: int) -> tuple[Floats32, OrthoPair]:
