@@ -46,7 +46,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
     (colmap.is_colmap, colmap.colmap),
     (kitti.is_kitti, kitti.kitti),
     (lambda text: "[LEFT_CAM_" in text, makers.zed),
-    (lambda text: f"{makers.MRPT}]" in text, makers.mrpt),
+    (lambda text: f"{makers.MRPT_POSE}]" in text, makers.mrpt),
     (lambda text: slam.DSO.search(text) is not None, slam.dso),
     (states(r"'lensmodel'"), slam.mrcal),
     (lambda text: makers.LISTED.search(text) is not None, makers.realsense),
@@ -70,7 +70,7 @@ NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[Cali
     (lambda f: f.values.keys() == {"Q"}, opencv.reprojection),
     (lambda f: bool(opencv.sides(opencv.by_side(f))), opencv.stereo_by_side),
     (lambda f: "value0" in f, slam.basalt),
-    (lambda f: "camRect0" in f.sub("intrinsics") if "intrinsics" in f else False, slam.dsec),
+    (lambda f: "intrinsics" in f and "camRect0" in f.sub("intrinsics"), slam.dsec),
     (makers.has_figures, makers.figures),
 )
 """Formats of nested entries. ORB-SLAM2 files with unrectified cameras are read as OpenCV's, as their images are

@@ -28,8 +28,8 @@ SECTION = re.compile(r"^[ \t]*\[(\w{1,40})\]((?:.*\n(?![ \t]*\[))*.*)", re.MULTI
 ENTRY = re.compile(r"^[ \t]*(\w{1,40})[ \t]*=[ \t]*(\S+)", re.MULTILINE)
 """Of a ``.conf``: a section with its text, and one of its entries."""
 
-MRPT = "_LEFT2RIGHT_POSE"
-"""End of the name of a section of MRPT's."""
+MRPT_POSE = "_LEFT2RIGHT_POSE"
+"""End of the name of MRPT's section with the pose of the right camera."""
 
 ZED_SIZES = {
     "VGA": (672, 376),
@@ -83,12 +83,12 @@ def _zed_lens(f: Fields, size: tuple[int, int]) -> Lens:
 def mrpt(text: str, path: Path) -> list[CalibratedCamera]:
     """Both cameras of MRPT's ``TStereoCamera``, as of the Malaga data set.
 
-    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and :data:`MRPT`, whose ``pose_quaternion``, x y z w x y z, is the pose
-    of the right camera in the left one's frame, metres.
+    Sections are ``NAME_LEFT``, ``NAME_RIGHT`` and that of :data:`MRPT_POSE`, whose ``pose_quaternion``, x y z and the
+    quaternion w x y z, is the pose of the right camera in the left one's frame, metres.
     """
     parts = {name: Fields.of_lines(assignments(body), str(path), f"{name} ") for name, body in SECTION.findall(text)}
-    whole = next(name for name in parts if name.endswith(MRPT)).removesuffix(MRPT)
-    names = (whole + end for end in (MRPT, "_LEFT", "_RIGHT"))
+    whole = next(name for name in parts if name.endswith(MRPT_POSE)).removesuffix(MRPT_POSE)
+    names = (whole + end for end in (MRPT_POSE, "_LEFT", "_RIGHT"))
     pose, *sides = (parts.get(name) or Fields({}, str(path), f"{name} ") for name in names)
     left, right = (f.distorted("dist", f.optics("fx fy cx cy", f.size("resolution"), "none").camera) for f in sides)
     numbers = pose.numbers("pose_quaternion", 7)

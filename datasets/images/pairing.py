@@ -387,12 +387,18 @@ def pair_up(
         return _with_gaps(by_key, rule, root)
     alone = [path for ours in by_key for key, path in ours.items() if key not in shared]
     if alone:
-        more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
-        text = f"{alone[0]} has no partner by {rule}{more}; {both}"
-        order = 'state images.pair = "order" if they belong together in order of their names; else '
-        remedy = f"{order if len(left) == len(right) else ''}add the missing image, or narrow the patterns"
-        raise IncompleteError("RIL-259", text, remedy=remedy)
+        raise _without_partner(alone, rule, both, evenly=len(left) == len(right))
     return _named([(path, by_key[1][key]) for key, path in by_key[0].items()])
+
+
+def _without_partner(alone: Sequence[Path], rule: str, both: str, *, evenly: bool) -> IncompleteError:
+    """Refusal of images without a partner; ``both``: all images in words, ``evenly``: as many left as right ones."""
+    more = f" (and {len(alone) - 1} more)" if len(alone) > 1 else ""
+    text = f"{alone[0]} has no partner by {rule}{more}; {both}"
+    order = 'state images.pair = "order" if they belong together in order of their names; else '
+    return IncompleteError(
+        "RIL-259", text, remedy=f"{order if evenly else ''}add the missing image, or narrow the patterns"
+    )
 
 
 def _fitting(left: Sequence[Path], right: Sequence[Path], names: Mapping[Path, str], joined: TimedPairs | None) -> str:

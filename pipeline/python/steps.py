@@ -88,8 +88,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
     from rille.pipeline.flow import tiles
     from rille.stages.calibration.doubt import doubts
     from rille.stages.hfvm.stage import facts, hfvm_stage, match_pyramids
-    from rille.stages.imaging import pyramid
-    from rille.stages.imaging.levels import levelled
+    from rille.stages.imaging import levels, pyramid
 
     carried, marks = settings_of(left), [mark for image in (left, right) for mark in noted(image).get("images", [None])]
     built: Any = config.build(carried, {"hfvm": hfvm})
@@ -106,7 +105,7 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
                 text = f"the {camera} image's values lie from {low:.3g} to {high:.3g}: {image.dtype} is taken as 0..255"
                 raise InputError("RIL-973", text, remedy="scale them to 0..255")
     # Images of a sequence are spread as its others are.
-    images, spread = (images, list[str]()) if "valid" in getattr(left, "coords", ()) else levelled(images)
+    images, spread = (images, list[str]()) if "valid" in getattr(left, "coords", ()) else levels.levelled(images)
     valid = [_valid(image) for image in (left, right)]
     first, second = (pyramid.build(image, built.pyramid, mask) for image, mask in zip(images, valid, strict=True))
     options = tiles.match_options(built.tiling, built.hfvm, built.pyramid, (images[0].shape, images[1].shape))
@@ -242,8 +241,7 @@ def terrain(
         Of :func:`match`, of this pair; pixels that :meth:`xarray.Dataset.where` masks count as unmatched. Enough are
         ``column_disparity`` and ``row_disparity`` (row, col), right minus left, px, NaN unknown: without ``validity``
         all known pixels count as matched, without ``disparity_std`` their standard deviation is
-        ``locus.sigma_disparity``. Without the attributes of :func:`match` parameters are those of the sequence, not
-        those that go with its preset.
+        ``locus.sigma_disparity``. Without its attributes no parameter follows its preset.
     pair
         The pair.
     reference
