@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from rille.pipeline.engine import memory, provenance
+from rille.pipeline.engine.caller import check
 from rille.pipeline.engine.events import Ledger, Progress
 from rille.pipeline.engine.failures import translated
 from rille.pipeline.engine.graph import Graph, Handle
@@ -38,7 +39,7 @@ from rille.pipeline.engine.runtime.interrupts import Interrupts
 from rille.pipeline.engine.store.arrays import DamagedError
 from rille.pipeline.engine.store.base import GoneError, Store, not_deterministic
 from rille.pipeline.engine.task import Outcome, Refs, Took, code_changed, key_of, map_ports, recipe
-from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, check, make, without_facts
+from rille.pipeline.engine.workers import Call, Died, Ended, Failed, NotBegun, Workers, make, without_facts
 from rille.stages.core.errors import DegenerateError, RilleError
 from rille.stages.core.quantities import some
 

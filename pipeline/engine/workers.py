@@ -4,24 +4,14 @@ A task is a future that depends on the futures of the tasks that make its inputs
 asking this process, gives a task to another worker if its own dies, and ends a worker that takes too much memory. What
 became of a task comes back as an event. A task that comes back because its workers died is named ``Died``; the run
 tries it once more when nothing else runs, so that the culprit is known for certain (:mod:`rille.pipeline.engine.run`).
-
-On this machine workers are spawned, never forked; they never see Ctrl-C, end with this process, and speak TLS on the
-loopback with keys of this run alone, because whoever reaches a scheduler of dask can run code as its user.
 """
 
 from __future__ import annotations
 
-import ast
 import asyncio
-import inspect
 import itertools
-import logging
-import math
-import multiprocessing
-import os
 import pickle
 import queue
-import re
 import time
 import traceback
 import uuid
@@ -30,27 +20,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, cast
 
-import psutil
-
 from rille.pipeline.engine import foreign
-from rille.pipeline.engine.runtime.environment import (
-    ignore_settings,
-    leave_out,
-    prepare_environment,
-    take_back,
-    worker_environment,
-)
+from rille.pipeline.engine.cluster import HURRY_SECONDS, LEAVE_SECONDS, Cluster, leave, quiet
+from rille.pipeline.engine.runtime.environment import ignore_settings, prepare_environment
 from rille.pipeline.engine.runtime.interrupts import held
-from rille.pipeline.engine.runtime.private import private_folder
 from rille.pipeline.engine.store.artifact import Ref
 from rille.pipeline.engine.task import Outcome, Refs, Spec, ensure, flatten_ports, map_ports
 from rille.stages.core.errors import ConfigError, RilleError
-
-KINDS = ("dask", "inline")
 
 WATCH_SECONDS = 0.2
 """Longest wait for the end of a task, and for workers, between two looks at lost calls and at the scheduler."""
@@ -61,9 +40,6 @@ CONNECT_SECONDS, ANSWER_SECONDS = 10.0, 20.0
 NO_WORKERS_SECONDS, START_SECONDS = 30.0, 120.0
 """Time without workers after which a run is given up: on another's scheduler, and on our own, where workers start
 slowly if the machine is busy."""
-
-LEAVE_SECONDS, HURRY_SECONDS = 2.0, 0.5
-"""Time to take leave of a scheduler at the end of a run, and of an interrupted one."""
 
 
 @dataclass(frozen=True)
@@ -132,61 +108,6 @@ class Died:
 Ended = Outcome | Failed | NotBegun | Died
 
 
-def check(kind: Any, jobs: int | None = None) -> None:
-    """Refuse an unknown executor before any work.
-
-    Raises
-    ------
-    ConfigError
-        It is neither one of the kinds nor an address nor an open ``Client`` of dask, or there are no ``jobs``; or this
-        process runs a program whose workers would run it again, may start no workers, or was forked after a run.
-    """
-    if not isinstance(kind, str):
-        from distributed import Client
-
-        # A closed one has no scheduler; calls of an asynchronous one give coroutines.
-        if not isinstance(kind, Client) or kind.scheduler is None or kind.asynchronous:
-            text = f"{kind!r} is no open Client of dask, or an asynchronous one"
-            raise ConfigError("RIL-588", text, remedy="give Client(...) without asynchronous=True, or leave client out")
-    elif kind not in KINDS and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d+", kind):
-        raise ConfigError("RIL-539", f"executor {kind!r} is unknown", remedy=f"{', '.join(KINDS)} or tcp://host:port")
-    if kind == "dask" and (where := _unguarded()):
-        text = f"{where} runs whenever the program is imported, which each worker does that starts"
-        raise ConfigError("RIL-972", text, remedy='put what the program does under `if __name__ == "__main__":`')
-    # One of multiprocessing's pools, or of another cluster of dask: Python lets no daemon start processes.
-    if kind == "dask" and multiprocessing.current_process().daemon:
-        text = "a process of a pool, or a worker of dask, cannot start workers"
-        raise ConfigError("RIL-542", text, remedy='give executor="inline"')
-    if _process_of_first_run() != os.getpid():
-        text = "this process was forked from one that had a run, whose threads it lacks: it would wait for ever"
-        raise ConfigError("RIL-543", text, remedy='start it by multiprocessing.get_context("spawn")')
-    if jobs is not None and jobs < 1:
-        raise ConfigError("RIL-540", f"{jobs} jobs are not permitted", remedy="give 1 or more")
-
-
-def _unguarded() -> str:
-    """Place in the program from which this is called, if a spawned worker, which imports the program, comes there, too;
-    empty if a guard keeps it away."""
-    for frame, line in traceback.walk_stack(inspect.currentframe()):
-        if frame.f_code.co_name == "<module>" and frame.f_globals.get("__name__") in ("__main__", "__mp_main__"):
-            file, spec = frame.f_code.co_filename, frame.f_globals.get("__spec__")
-            if spec is not None and spec.name.endswith("__main__"):  # of a package: no worker imports that
-                return ""
-            try:
-                statements = ast.parse(Path(file).read_bytes()).body
-            except (OSError, SyntaxError, ValueError):  # of an interactive Python there is no file
-                return ""
-            here = [ast.unparse(one) for one in statements if one.lineno <= line <= (one.end_lineno or 0)]
-            return "" if any("__name__" in statement for statement in here) else f"line {line} of {file}"
-    return ""
-
-
-@cache
-def _process_of_first_run() -> int:
-    """Return the number of the process that asked first; a fork inherits the answer."""
-    return os.getpid()
-
-
 def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
     """``inline``, or workers of dask: ``dask`` (of this machine), the address of a scheduler, or a ``Client``.
 
@@ -200,7 +121,10 @@ def make(kind: Any, jobs: int, cache: Path, memory: float) -> Workers:
     """
     if kind == "inline":
         return Inline()
-    return _here(jobs, memory) if kind == "dask" else _elsewhere(kind, cache)
+    if kind == "dask":
+        own = Cluster(jobs, memory)
+        return Dask(own.client, own=own)
+    return _elsewhere(kind, cache)
 
 
 class Inline:
@@ -239,56 +163,13 @@ class Inline:
             warnings.filterwarnings("ignore", message="coroutine .* was never awaited", category=RuntimeWarning)
 
 
-def _here(jobs: int, memory: float) -> Dask:
-    """Workers of this machine; they start while this process goes on."""
-    leave_out()  # before anything else is imported
-    from distributed import Client, LocalCluster, Nanny
-
-    nannies = list[Any]()
-
-    class Known(Nanny):  # type: ignore[misc]  # dask's types are unknown
-        """One that can be ended while its worker still starts: a cluster knows it only afterwards."""
-
-        def __init__(self, *args: Any, **options: Any) -> None:
-            super().__init__(*args, **options)
-            nannies.append(self)
-
-    _configure()
-    resource_tracker.ensure_running()  # it unblocks the signal in the thread that happens to start it
-    with held(), warnings.catch_warnings():
-        # A queue within this process is named by the machine's address, which it may not have.
-        warnings.filterwarnings("ignore", "Couldn't detect a suitable IP address", RuntimeWarning)
-        cluster = LocalCluster(
-            # With workers LocalCluster would block until they run; scale() returns at once.
-            n_workers=0,
-            worker_class=Known,
-            threads_per_worker=1,
-            security=True,
-            host="127.0.0.1",
-            # For the workers, and for the client: it shares the process, and needs no socket.
-            scheduler_kwargs={"host": ["127.0.0.1", None], "protocol": ["tls://", "inproc://"]},
-            # Port 0 is any free one: dask's own, 8787, may belong to another run.
-            dashboard_address="127.0.0.1:0",
-            worker_dashboard_address=None,
-            local_directory=str(private_folder() / "dask"),
-            memory_limit=int(memory) if math.isfinite(memory) else 0,
-            silence_logs=logging.CRITICAL,
-        )
-        _, within = cluster.scheduler.listeners
-        # As the default client it would take over whatever else the calling program computes with dask.
-        client = Client(within.contact_address, loop=cluster.loop, set_as_default=False)
-        made = Dask(client, cluster=cluster, nannies=nannies)
-        made.scale(jobs)
-    return made
-
-
 def _elsewhere(where: Any, cache: Path) -> Dask:
     """Workers of the scheduler at an address, or behind a ``Client``, if they are like this process."""
     from distributed import Client
 
     client = where
     if isinstance(where, str):
-        _quiet()
+        quiet()
         try:
             client = Client(where, set_as_default=False, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
@@ -308,17 +189,16 @@ def _elsewhere(where: Any, cache: Path) -> Dask:
 
 
 class Dask:
-    """Workers of dask; ``cluster`` is one of our own, with its ``nannies``, ``ours`` whether the client is."""
+    """Workers behind a client of dask, which is ``ours`` or another's; ``own`` is the cluster if we have started it."""
 
-    def __init__(self, client: Any, *, cluster: Any = None, nannies: Sequence[Any] = (), ours: bool = True) -> None:
-        self._client, self._cluster, self._nannies, self._ours = client, cluster, nannies, ours
+    def __init__(self, client: Any, *, own: Cluster | None = None, ours: bool = True) -> None:
+        self._client, self._own, self._ours = client, own, ours
         self._address = client.scheduler.address
         self._run, self._unused = f"rille-{uuid.uuid4().hex}", itertools.count()
         self._looked = self._manned = time.monotonic()
         self._futures: dict[int, Any] = {}
         self._leaving: list[Any] = []
         self._events: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._dead: set[Any] = set()
         client.subscribe_topic(self._run, self._hear)
 
     def submit(self, calls: Sequence[Call]) -> None:
@@ -339,7 +219,7 @@ class Dask:
             [pickle.dumps((names[call.number], call)) for call in calls],
             [[Alias(known[number]) for number in call.upstream()] for call in calls],
             run=self._run,
-            ours=self._cluster is not None,
+            ours=self._own is not None,
             key=[*names.values()],
             priority=-calls[0].number,
         )
@@ -414,13 +294,13 @@ class Dask:
             workers = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_SECONDS)
         except Exception as error:
             raise self._gone() from error
-        now, patience = time.monotonic(), NO_WORKERS_SECONDS if self._cluster is None else START_SECONDS
+        now, patience = time.monotonic(), NO_WORKERS_SECONDS if self._own is None else START_SECONDS
         if workers:
             self._manned = now
         elif now - self._manned > patience:
             text = f"the dask scheduler at {self._address} had no workers for {patience:.0f} s"
             remedy = "start workers, and run the same command: what is committed stays"
-            if self._cluster is not None:  # Python's own file may be closed to this user, or memory be short
+            if self._own is not None:  # Python's own file may be closed to this user, or memory be short
                 remedy = "look why this user can start no processes, or run it with --executor inline, which needs none"
             raise RilleError("RIL-525", text, remedy=remedy)
         return sum(workers.values())
@@ -434,19 +314,14 @@ class Dask:
     def _look(self) -> None:
         """Look whether the scheduler is there and has workers, and which workers of our own are gone."""
         self.threads()
-        if self._cluster is not None:
-            # A nanny does not start a worker again that died just as it began: after two looks we do.
-            dead = {nanny for nanny in self._cluster.workers.values() if not nanny.is_alive()}
-            for nanny in dead & self._dead:
-                # Nannies belong to the event loop of the client: their methods must run there.
-                self._client.loop.add_callback(nanny.instantiate)
-            self._dead = dead - self._dead
+        if self._own is not None:
+            self._own.revive()
         self._looked = time.monotonic()
 
     def scale(self, jobs: int) -> None:
-        """Have so many workers of our own; tasks of those that go are begun on others."""
-        if self._cluster is not None:
-            self._cluster.scale(jobs)
+        """Have so many workers, if they are our own."""
+        if self._own is not None:
+            self._own.scale(jobs)
 
     def cancel(self) -> None:
         """Begin nothing that was submitted, and forget what is running."""
@@ -456,33 +331,14 @@ class Dask:
 
     def close(self, *, kill: bool = False) -> None:
         """End workers of our own, at once if ``kill``; leave others as they are."""
-        within = HURRY_SECONDS if kill else LEAVE_SECONDS
         self.cancel()
-        if self._cluster is None:
-            with suppress(Exception):
-                self._client.unsubscribe_topic(self._run)
-            if self._ours:
-                _leave(self._client, within)
+        if self._own is not None:
+            self._own.close(kill=kill)
             return
-        until = time.monotonic() + LEAVE_SECONDS
-        while kill and self._beginning() and time.monotonic() < until:
-            time.sleep(0.01)
-        processes = [nanny.pid for nanny in self._nannies if nanny.pid]
-        if kill:
-            for nanny in self._nannies:
-                nanny.close_gracefully()  # else it starts a worker again as soon as that is killed
-            _kill(processes)
-        _leave(self._client, within)
         with suppress(Exception):
-            self._cluster.close(timeout=within)
-        self._cluster.shutdown_on_close = False  # else it is closed once more at exit, for up to ten seconds
-        _kill(processes)
-        take_back()
-
-    def _beginning(self) -> bool:
-        """Whether a worker of our own that is to start has no number yet by which it could be killed."""
-        begun = [nanny for nanny in self._nannies if nanny.pid or nanny.status.name == "closed"]
-        return len(begun) < max(len(self._nannies), len(self._cluster.worker_spec))
+            self._client.unsubscribe_topic(self._run)
+        if self._ours:
+            leave(self._client, HURRY_SECONDS if kill else LEAVE_SECONDS)
 
 
 Workers = Inline | Dask
@@ -527,64 +383,3 @@ def _prepare(*, ours: bool) -> None:
     prepare_environment()
     if ours:
         ignore_settings()
-
-
-def _configure() -> None:
-    """Set dask up for workers of our own: no word in its logs, nothing at regular times that nobody looks at; no
-    spilling or pausing, because what travels is small."""
-    import dask
-
-    _quiet()
-    environment = worker_environment() | {
-        "PYTHONSAFEPATH": "1",
-        "DASK_DISTRIBUTED__LOGGING__DISTRIBUTED": "critical",
-        "MALLOC_ARENA_MAX": "1",  # tasks run on a second thread, whose own arena gives memory back and takes it anew
-    }
-    memory = {f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")}
-    dask.config.set(
-        {
-            # After one death of its worker dask begins a task once more; at the next it gives it back.
-            "distributed.scheduler.allowed-failures": 1,
-            # By default a cluster forgets a worker for good whose nanny has not started it again within 15 s, which on
-            # a busy machine is usual.
-            "distributed.deploy.lost-worker-timeout": "1h",
-            # A share of the limit: the bytes given are meant whole, by default dask ends a worker at 95 % of them.
-            "distributed.worker.memory.terminate": 1.0,
-            # Entries of each of dask's logs, which nobody reads; some keep whole messages, with all tasks in them.
-            "distributed.admin.low-level-log-length": 10,
-            "distributed.scheduler.active-memory-manager.start": False,
-            "distributed.worker.profile.enabled": False,
-            "distributed.worker.memory.monitor-interval": "500ms",
-            "distributed.scheduler.work-stealing-interval": "1s",
-            "distributed.admin.tick.interval": "5s",
-            "distributed.admin.system-monitor.interval": "5s",
-            "distributed.client.scheduler-info-interval": "10s",
-            "distributed.nanny.pre-spawn-environ": environment,
-            **memory,
-        }
-    )
-
-
-def _quiet() -> None:
-    """Silence distributed's log: what matters comes back as an exception, the rest is noise at shutdown."""
-    import dask
-
-    names = ("distributed", "distributed.client", "distributed.worker", "distributed.nanny", "distributed.scheduler")
-    dask.config.set({"distributed.logging": dict.fromkeys(names, "critical")})
-    for name in (*names, "tornado", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-
-
-def _leave(client: Any, within: float) -> None:
-    with suppress(Exception):
-        client.close(timeout=within)
-
-
-def _kill(processes: list[int]) -> None:
-    """Kill processes, and wait until they are gone."""
-    killed = []
-    for process in processes:
-        with suppress(psutil.Error):
-            killed.append(psutil.Process(process))
-            killed[-1].kill()
-    psutil.wait_procs(killed, timeout=LEAVE_SECONDS)

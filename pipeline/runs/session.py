@@ -22,6 +22,7 @@ from rille.datasets.registry import open_sequence
 from rille.datasets.text.reading import read_toml
 from rille.pipeline.engine import events, memory
 from rille.pipeline.engine import run as driver
+from rille.pipeline.engine.caller import check
 from rille.pipeline.engine.failures import reason_of
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.keys import installed, remember
@@ -30,7 +31,7 @@ from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.engine.runtime.environment import permit_open_files
 from rille.pipeline.engine.store.base import Store
 from rille.pipeline.engine.store.maintenance import note_runs
-from rille.pipeline.engine.workers import Workers, check
+from rille.pipeline.engine.workers import Workers
 from rille.pipeline.export.view import UNSTATED, RunView, Settled
 from rille.pipeline.flow import config as configuration
 from rille.pipeline.flow import unread

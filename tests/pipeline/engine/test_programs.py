@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,8 +23,8 @@ from distributed import Client, LocalCluster
 from raising import raises
 from toys.chain import build
 
+from rille.pipeline.engine import caller, workers
 from rille.pipeline.engine import run as driver
-from rille.pipeline.engine import workers
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store import maintenance
 from rille.pipeline.engine.store.base import Store
@@ -160,7 +161,7 @@ def test_an_edit_computes_again_exactly_what_it_can_change(editable):
 @pytest.mark.parametrize("client", [5, SimpleNamespace(scheduler=None)])
 def test_what_is_no_open_client_is_refused(client):
     with raises("RIL-588", "no open Client"):
-        workers.check(client)
+        caller.check(client)
 
 
 def test_of_clusters_and_clients_only_a_synchronous_client_is_taken():
@@ -171,13 +172,13 @@ def test_of_clusters_and_clients_only_a_synchronous_client_is_taken():
         ):
             for given in (cluster, client):
                 with raises("RIL-588"):
-                    workers.check(given)
+                    caller.check(given)
 
     asyncio.run(refused())
     with LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster, Client(cluster) as client:
-        workers.check(client)
+        caller.check(client)
         with raises("RIL-588"):
-            workers.check(cluster)
+            caller.check(cluster)
 
 
 def code_in_a_pool(how, kind):
@@ -188,7 +189,7 @@ def code_in_a_pool(how, kind):
 
 def code_of_refusal(kind):
     try:
-        workers.check(kind)
+        caller.check(kind)
     except ConfigError as error:
         return error.code
     return ""
@@ -200,7 +201,7 @@ def test_a_process_of_a_pool_starts_no_workers():
 
 
 def test_a_process_forked_after_a_run_is_refused():
-    workers.check("inline")
+    caller.check("inline")
     assert code_in_a_pool("fork", "inline") == "RIL-543"
 
 
@@ -208,8 +209,8 @@ def test_a_process_forked_after_a_run_is_refused():
 def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_path, name):
     program = tmp_path / "program.py"
     program.write_text(
-        "from rille.pipeline.engine import workers\n"
-        "def work(kind):\n    workers.check(kind)\n"
+        "from rille.pipeline.engine import caller\n"
+        "def work(kind):\n    caller.check(kind)\n"
         "work('inline')\n"
         "if __name__ in ('__main__', '__mp_main__'):\n    work('dask')\n"
         "work('dask') if __name__ else None\n"
@@ -219,13 +220,13 @@ def test_a_program_without_a_guard_is_refused_before_its_workers_import_it(tmp_p
         file.write("for kind in ('inline', 'dask'):\n    work(kind)\n")
     with raises("RIL-972", f"line 9 of {program}"):
         runpy.run_path(str(program), run_name=name)
-    exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": workers.check})  # no worker imports it
+    exec(compile("work('dask')", "<stdin>", "exec"), {"__name__": name, "work": caller.check})  # no worker imports it
 
 
 def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):
     """No worker imports its ``__main__``."""
     (tmp_path / "package").mkdir()
-    begin = "from rille.pipeline.engine import workers\nworkers.check('dask')\n"
+    begin = "from rille.pipeline.engine import caller\ncaller.check('dask')\n"
     for name in ("__init__.py", "__main__.py"):
         (tmp_path / "package" / name).write_text(begin if name == "__main__.py" else "")
     monkeypatch.syspath_prepend(tmp_path)
@@ -234,7 +235,7 @@ def test_a_package_that_is_run_needs_no_guard(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("begun", [0, 1, 2])
 def test_no_worker_that_still_starts_outlives_a_run_that_is_broken_off(begun, tmp_path):
-    workers.resource_tracker.ensure_running()
+    resource_tracker.ensure_running()
     before = set(psutil.Process().children())
     made = workers.make("dask", 2, tmp_path, math.inf)
     while len(set(psutil.Process().children()) - before) < begun:

@@ -14,7 +14,7 @@ from hands import by_hand
 from raising import raises
 from toys import chain
 
-from rille.pipeline.engine import events, foreign, workers
+from rille.pipeline.engine import caller, events, foreign, workers
 from rille.pipeline.engine import run as driver
 from rille.pipeline.engine.graph import Graph
 from rille.pipeline.engine.store.base import Store
@@ -119,7 +119,7 @@ def test_no_scheduler(tmp_path, address, monkeypatch):
 @pytest.mark.parametrize("kind", ["proceses", "tcp://", "tcp://host", "http://host:80", "tcp:host:80"])
 def test_unknown_executors(kind):
     with raises("RIL-539"):
-        workers.check(kind)
+        caller.check(kind)
 
 
 def test_threads_of_libraries_are_refused(tmp_path, monkeypatch):
