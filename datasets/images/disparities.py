@@ -6,10 +6,11 @@ Files are PFM, TIFF and npy of floating point, pixels, or PNG of 16 bits as KITT
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 from warnings import catch_warnings
 
 import numpy as np
@@ -42,15 +43,34 @@ def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
     InputError
         The file is damaged, of another kind or size, or its values are of another type.
     """
+    with _told(name):
+        values = _begun(BytesIO(data), size)().astype(np.float32)
+    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
+
+
+def check_header(path: Path, size: tuple[int, int]) -> None:
+    """Refuse, as :func:`decode` does, a map by its header alone."""
+    with _told(str(path)), path.open("rb") as file:
+        _begun(file, size)
+
+
+@contextmanager
+def _told(name: str) -> Iterator[None]:
+    """Errors while a map is read name it; parsers of a damaged file warn and raise anything."""
     try:
         with catch_warnings(action="ignore"):
-            # First bytes of NumPy's files.
-            values = _numpy(data, size) if data.startswith(b"\x93NUMPY") else _image(data, size)
-            values = values.astype(np.float32)
-    except Exception as error:  # parsers of a damaged file raise anything
+            yield
+    except Exception as error:
         text = f"{name} cannot be read as a map of disparities: {' '.join(str(error).split())[:100]}"
         raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
-    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
+
+
+def _begun(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
+    """Check the header of a map; what unpacks its values."""
+    magic = file.read(6)
+    file.seek(0)
+    # First bytes of NumPy's files.
+    return _numpy(file, size) if magic == b"\x93NUMPY" else _image(file, size)
 
 
 def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> None:
@@ -62,29 +82,33 @@ def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> No
         raise ValueError("its values are of a type whose unit is not known")
 
 
-def _numpy(data: bytes, size: tuple[int, int]) -> AnyArray:
+def _numpy(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
     """An array of NumPy, without execution of any content, and without more memory than the file has."""
-    file = BytesIO(data)
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
     shape = tuple(side for side in shape if side != 1)  # networks have one channel, and one image a batch
     _check(shape[::-1], size, dtype.kind == "f")
-    return np.frombuffer(data, dtype, size[0] * size[1], file.tell()).reshape(shape, order="F" if by_columns else "C")
+    order: Literal["F", "C"] = "F" if by_columns else "C"
+    return lambda: np.frombuffer(file.read(), dtype, size[0] * size[1]).reshape(shape, order=order)
 
 
-def _image(data: bytes, size: tuple[int, int]) -> AnyArray:
+def _image(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
     """An image of disparities."""
-    image = opened(BytesIO(data))
+    image = opened(file)
     if image is None:
         raise ValueError("it is of no kind that is read")
     coded = image.format == "PNG" and image.mode == "I;16"
     _check(image.size, size, coded or image.mode == "F")
-    # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
-    values = np.asarray(image, np.float32) / (256 if coded else 1)
-    # GDAL's tag of TIFF: value of the pixels without data.
-    if image.format == "TIFF" and 42113 in image.tag_v2:
-        values[values == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
-    return values
+
+    def pixels() -> AnyArray:
+        # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
+        values = np.asarray(image, np.float32) / (256 if coded else 1)
+        # GDAL's tag of TIFF: value of the pixels without data.
+        if image.format == "TIFF" and 42113 in image.tag_v2:
+            values[values == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
+        return values
+
+    return pixels
 
 
 def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:
@@ -141,13 +165,19 @@ def disparity_stage(
     digests: Mapping[str, str],
     paths: Mapping[str, str],
 ) -> Bundle[ImageFacts]:
-    """Disparities of a left image that another program wrote."""
-    arrays = {}
+    """Disparities of a left image that another program wrote; unknown everywhere if its file is damaged."""
+    arrays: dict[str, AnyArray] = {}
+    meta: ImageFacts = {"frame": frame, "camera": "left"}
     for array, digest in digests.items():
-        name = f"frame {frame}, map {paths[array]}"
-        arrays[array] = decode(files.read_unchanged(Path(paths[array]), digest, name), (size[0], size[1]), name)
+        path = Path(paths[array])
+        data = files.read_unchanged(path, digest, f"frame {frame}, map {path}")
+        try:
+            # Without its folder, which is not in the task's key.
+            arrays[array] = decode(data, (size[0], size[1]), path.name)
+        except InputError as error:
+            arrays[array], meta["damage"] = np.full(size[::-1], np.nan, np.float32), error.message
     if sign == "left-right":
         arrays["column_disparity"] *= -1
     if sigma is not None:
         arrays["disparity_std"] = np.full_like(arrays["column_disparity"], sigma)
-    return Bundle(arrays, {"frame": frame, "camera": "left"})
+    return Bundle(arrays, meta)

@@ -25,7 +25,7 @@ from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
 from rille.datasets.text.names import derived_name
-from rille.datasets.text.reading import Search, nearest_hint, read_bytes
+from rille.datasets.text.reading import Search, nearest_hint
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import IncompleteError, InputError, within
 
@@ -165,9 +165,15 @@ def _disparity(
         maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
+    bad = dict[Path, InputError]()
     for of in maps.values():
-        first = next(iter(of.values()))
-        disparities.decode(read_bytes(first, "map", files.MOST_BYTES), size, str(first))  # raises errors early
+        for left, path in of.items():
+            try:
+                disparities.check_header(path, size)
+            except InputError as error:
+                bad[left] = error
+    if bad and len(bad) == len(set.intersection(*(set(of) for of in maps.values()))):
+        raise next(iter(bad.values()))
 
     def source(frame: int) -> Source:
         paths = {array: of[pairs[frame].left] for array, of in maps.items()}
@@ -175,8 +181,10 @@ def _disparity(
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
-    lacking = (k for k, pair in enumerate(pairs) if any(pair.left not in of for of in maps.values()))
-    return source, {k: f"the map of {pairs[k].left.name} ({key}) is missing" for k in lacking}
+    absent = {left: f"{error.message} ({key})" for left, error in bad.items()}
+    lacking = (pair.left for pair in pairs if any(pair.left not in of for of in maps.values()))
+    absent |= {left: f"the map of {left.name} ({key}) is missing" for left in lacking}
+    return source, {k: absent[pair.left] for k, pair in enumerate(pairs) if pair.left in absent}
 
 
 def default_name(path: Path) -> str:

@@ -129,7 +129,9 @@ def hfvm_given_stage(params: HfvmParams, left: Bundle, right: Bundle, given: Bun
     said = facts(arrays, params, ImageDifference(), int(np.count_nonzero(a.valid[0])))
     column = np.asarray(given["column_disparity"])
     own, doubt = borne_out(arrays, column), "the maps of [disparity]"
-    if of_right_image(a, b, column, params, own):
+    if "damage" in given.meta:
+        said["warnings"] = [f"{given.meta['damage']}: its pair has no disparities"]
+    elif of_right_image(a, b, column, params, own):
         said["warnings"] = [f"{doubt} are those of the right images: give those of the left ones"]
     elif own < MIN_BORNE_OUT:
         fit = better_reading(a.images[0], b.images[0], column)

@@ -261,3 +261,28 @@ def test_maps_are_of_undistorted_and_unmoved_images(tmp_path):
 def test_bad_tables(tmp_path, line):
     with raises("RIL-223", line.split()[0]):
         sequence(tmp_path, f'left = "disp/*.npy"\n{line}')
+
+
+def test_a_bad_map_costs_its_own_pair_alone(tmp_path, materialise):
+    sequence(tmp_path)
+    np.save(tmp_path / "disp" / "01.npy", np.ones((4, 5), np.float32))
+    s = open_manifest(tmp_path / "rover.rille.toml", Digests())
+    assert list(s.lost) == [1]
+    assert "01.npy" in s.lost[1]
+    assert "5 x 4 values" in s.lost[1]
+    assert (materialise(s.disparity(2))["column_disparity"] == -30).all()
+    for k in (0, 2):
+        np.save(tmp_path / "disp" / f"{k:02d}.npy", np.ones((4, 5), np.float32))
+    with raises("RIL-900", "00.npy"):
+        open_manifest(tmp_path / "rover.rille.toml", Digests())
+
+
+def test_a_map_that_is_damaged_behind_its_header_is_empty(tmp_path, materialise):
+    sequence(tmp_path, 'left = "disp/*.npy"\nsigma = 0.5')
+    file = tmp_path / "disp" / "01.npy"
+    file.write_bytes(file.read_bytes()[:-8])
+    s = open_manifest(tmp_path / "rover.rille.toml", Digests())
+    assert not s.lost
+    bundle = materialise(s.disparity(1))
+    assert np.isnan(bundle["column_disparity"]).all()
+    assert "01.npy" in bundle.meta["damage"]
