@@ -124,7 +124,7 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path
     Raises
     ------
     InputError
-        No image has a map, or the pattern is none.
+        No image has a map, maps are counted from another number than images are, or the pattern is none.
     """
     with within(key):
         maps = sorted(Search().matching(root, pattern), key=lambda path: natural(path.name))
@@ -133,8 +133,13 @@ def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path
         ours, theirs = ({name(path): path for path in paths} for paths in (maps, lefts))
         if len(ours) == len(maps) and len(theirs) == len(lefts):  # else keys are not unique
             found = max(found, {path: ours[one] for one, path in theirs.items() if one in ours}, key=len)
-    if len(maps) == len(lefts) and (len(maps) == 1 or not found):
-        found = dict(zip(lefts, maps, strict=True))
+    if len(maps) == len(lefts) and len(found) < len(maps):
+        in_order = dict(zip(lefts, maps, strict=True))
+        if len(maps) == 1 or not found:
+            found = in_order
+        # As many, counted from another number: each would be of another image.
+        elif len({last_number(one) - last_number(left) for left, one in in_order.items()}) == 1:
+            found = {}
     if found:
         return found
     those = ends(maps) if maps else f"none in {root}"

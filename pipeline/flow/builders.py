@@ -235,13 +235,19 @@ class Builder:
         return self.node(synchrony_stage, label, **images, pairs=list(pairs), frames=near, rig=self.given_rig)
 
     @once
+    def given_disparity(self, pair: int) -> Handle | None:
+        """Disparity of the left image of a pair as another program made it; None: the sequence has none."""
+        make = self.sequence.disparity
+        return None if make is None else self.source(make(pair), f"disparity/{pair}")
+
+    @once
     def disparity(self, pair: int) -> Handle:
         """Disparity of the left image of a pair: the matcher's, or that of another program, checked."""
         label = f"hfvm/{pair}"
-        if self.sequence.disparity is None:
+        given = self.given_disparity(pair)
+        if given is None:
             return self._matched(label, pair, "left", "right")
-        ports: dict[str, Handle] = {side: self.pyramid(pair, side) for side in CAMERAS}
-        ports["given"] = self.source(self.sequence.disparity(pair), f"disparity/{pair}")
+        ports: dict[str, Handle] = {side: self.pyramid(pair, side) for side in CAMERAS} | {"given": given}
         # By name: it has no section of its own, but reads the matcher's.
         return self.graph.node("rille.stages.hfvm.given", label, self.config.hfvm, {}, {}, ports)
 

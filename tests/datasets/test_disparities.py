@@ -166,6 +166,7 @@ def test_maps_are_paired_by_name_number_or_order(tmp_path, lefts, maps, wanted):
     ("lefts", "maps", "lacking"),
     [
         ("a.png b.png", "1.npy 2.npy 3.npy", ""),
+        ("00.png 01.png 02.png", "d1.npy d2.npy d3.npy", "d1.npy"),  # counted from 1
         ("a.png b.png", "map.npy", ""),
         ("a.png", "", "none in /"),
     ],

@@ -117,7 +117,8 @@ class Inspection:
         self.say(judge.judge_rig(s.rig))
         self.say(*(records(s, self.frames) for records in judge.RECORDS))
         yield from self._images()
-        whole = [k for k in self.frames if not any((k, camera) in self.broken for camera in CAMERAS)]
+        broken = {frame for frame, _ in self.broken}
+        whole = [k for k in self.frames if k not in broken]
         if not whole:
             self.say(judge.judge("matching", "no pair of images is whole", {"whole pairs": 0}))
             return
@@ -128,12 +129,13 @@ class Inspection:
             yield from self._times(whole)
 
     def _images(self) -> Steps:
-        """Open every image: repetitions, exposure, sharpness."""
+        """Open every image, and map of another program: repetitions, exposure, sharpness."""
         errors = list[RilleError]()
         images = {(frame, camera): self.make.raw_image(frame, camera) for frame in self.frames for camera in CAMERAS}
         seen = {frame: self.make.quality(frame) for frame in self.frames}
-        yield Maybe([*images.values(), *seen.values()])
-        for at, handle in images.items():
+        maps = {(k, "map"): given for k in self.frames if (given := self.make.given_disparity(k)) is not None}
+        yield Maybe([*images.values(), *maps.values(), *seen.values()])
+        for at, handle in (images | maps).items():
             try:
                 if handle.ref is None:
                     raise _cause(handle)
@@ -148,7 +150,8 @@ class Inspection:
         # More are only counted.
         for refusal in errors[:3]:
             self.refused(refusal, "images")
-        text = f"{len(errors)} of {len(images)} images cannot be used" if errors else f"all {len(images)} open"
+        count = f"{len(images) + len(maps)} images{' and maps' if maps else ''}"
+        text = f"{len(errors)} of {count} cannot be used" if errors else f"all {len(images) + len(maps)} open"
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
         # As the cameras took them: one image is two when the lenses of two cameras are taken out of it. Images of one
         # grey value do not count as repeated.

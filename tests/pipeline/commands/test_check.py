@@ -83,6 +83,23 @@ def test_a_sound_folder_passes(tmp_path, capsys):
     assert "4 of 4 pairs" in line(lines, "sequence")
 
 
+def test_a_damaged_map_of_another_program_is_named(tmp_path, capsys):
+    path = folder(tmp_path / "wall")
+    (path / "maps").mkdir()
+    for k in range(4):
+        np.save(path / "maps" / f"{k:03d}.npy", np.full((ROWS, COLUMNS), 8.0, np.float32))
+    file = path / "maps" / "001.npy"
+    file.write_bytes(file.read_bytes()[:-40])
+    text = '[images]\nleft = "left/*.png"\nright = "right/*.png"\n[cameras]\nfile = "calib.txt"\n'
+    (path / "wall.rille.toml").write_text(f'{text}[disparity]\nleft = "maps/*.npy"\n')
+    code, lines = run(path / "wall.rille.toml", capsys)
+    assert code == 1
+    failed = [text for text in lines if text.startswith("FAIL")]
+    assert "frame 1, 001.npy" in failed[0]
+    assert "1 of 12 images and maps" in failed[1]
+    assert "median 4 m" in line(lines, "matching")
+
+
 def test_a_cache_that_cannot_be_written_costs_nothing_but_what_it_would_keep(tmp_path, capsys):
     path = folder(tmp_path / "wall")
     (tmp_path / "cache").write_text("no folder")
