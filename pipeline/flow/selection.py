@@ -143,7 +143,7 @@ def simultaneous(
         alone = set[int]() if late else misfits(choice, mode)
         if alone:
             make.graph.outdated |= {one.index for one in p.rigs.values()}
-            odd |= dict.fromkeys(alone, MISFIT)
+            odd |= {pair: _misfit(make, pair) for pair in alone}
         elif any("knocked" in one.meta for one in choice.judged):
             p.contradictions.append(p.rigs[choice.basic[0]])
             # One calibration does not describe this rig: each pair has its own.
@@ -189,6 +189,12 @@ def misfits(choice: Choice, mode: str) -> set[int]:
     # If the rig had moved, the next pair would not fit, either.
     alone = {b for a, b, c in zip(basic, basic[1:], basic[2:], strict=False) if bad & {a, b, c} == {b}}
     return alone if 4 * len(bad) <= len(basic) else set()
+
+
+def _misfit(make: Builder, pair: int) -> str:
+    """Why a pair does not fit: the damage of its map by another program, or its images."""
+    given = make.given_disparity(pair)
+    return MISFIT if given is None or given.ref is None else given.ref.meta.get("damage", MISFIT)
 
 
 def synchrony_of_late(make: Builder, late: list[int], whole: list[int]) -> Handle[SynchronyFacts]:

@@ -79,3 +79,36 @@ def test_a_map_of_another_size_ends_with_its_name(tmp_path: Path) -> None:
     (tmp_path / "cones.rille.toml").write_text(MANIFEST)
     with raises("RIL-900", "sgbm.npy", "225 x 188", "450 x 375"):
         rille.open(tmp_path / "cones.rille.toml")
+
+
+def test_a_damaged_map_is_why_its_frame_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # A wall 4 m away, seen at 8 px of disparity, that moves by 5 px a frame.
+    noise = cv2.GaussianBlur(np.random.default_rng(3).standard_normal((160, 320)), (0, 0), 1.5)
+    wall = np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.uint8)
+    for folder in ("left", "right", "maps"):
+        (tmp_path / folder).mkdir()
+    for k in range(7):
+        for side, column in (("left", 20 + 5 * k), ("right", 28 + 5 * k)):
+            assert cv2.imwrite(str(tmp_path / side / f"{k}.png"), wall[:, column : column + 220])
+        np.save(tmp_path / "maps" / f"{k}.npy", np.full((160, 220), 8.0, np.float32))
+    file = tmp_path / "maps" / "3.npy"
+    file.write_bytes(file.read_bytes()[:-40])
+    (tmp_path / "wall.rille.toml").write_text("""
+[images]
+left = "left/*.png"
+right = "right/*.png"
+[cameras]
+fx = 200.0
+cx = 109.5
+cy = 79.5
+[rig]
+baseline = 0.16
+[disparity]
+left = "maps/*.npy"
+[defaults]
+keyframes.stride = 1
+crosscheck.enabled = false
+""")
+    where = {"runs": tmp_path / "runs", "cache": tmp_path / "cache", "executor": "inline"}
+    rille.reconstruct(tmp_path / "wall.rille.toml", **where, quiet=True)
+    assert "frame 3 lost: 3.npy cannot be read" in capsys.readouterr().err
