@@ -105,9 +105,12 @@ def mark(status: os.stat_result) -> str:
 
 
 def missing_target(path: str | Path, name: str = "it") -> str:
-    """That a path, called ``name``, is a link to a missing file, in words; empty: it is none."""
-    broken = os.path.islink(path) and not os.path.exists(path)
-    return f"{name} is a link to {os.readlink(path)}, which is missing" if broken else ""
+    """That a path, called ``name``, is a link to a missing file, in words; empty: it is none, or a closed one."""
+    try:
+        target = os.readlink(path)
+    except (OSError, ValueError):  # as of another user's process below /proc
+        return ""
+    return "" if os.path.exists(path) else f"{name} is a link to {target}, which is missing"
 
 
 def nearest_hint(path: Path) -> str:

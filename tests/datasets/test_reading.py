@@ -228,6 +228,18 @@ def test_pointers_are_named(tmp_path, name, pointer):
     refused("RIL-820", open_sequence, str(path.parent if "/" in name else path))
 
 
+def test_links_that_cannot_be_read_are_no_missing_files(tmp_path, monkeypatch):
+    closed = tmp_path / "cwd"
+    closed.symlink_to(tmp_path / "gone")
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "readlink", refuse)  # as of another user's process below /proc
+    assert reading.missing_target(closed) == ""
+    assert not reading.is_file(closed)
+
+
 def test_links_that_lead_nowhere_are_said(tmp_path):
     (tmp_path / "calib.yaml").symlink_to(tmp_path / "absent")
     assert "a link to" in refused("RIL-138", read_cameras, tmp_path / "calib.yaml")
