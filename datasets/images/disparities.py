@@ -43,20 +43,26 @@ def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
     InputError
         The file is damaged, of another kind or size, or its values are of another type.
     """
-    with _told(name):
-        values = _begun(BytesIO(data), size)().astype(np.float32)
+    with _refusal(name):
+        values = _unpacker(BytesIO(data), size)().astype(np.float32)
     return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
 
 
-def check_header(path: Path, size: tuple[int, int]) -> None:
-    """Refuse, as :func:`decode` does, a map by its header alone."""
-    with _told(str(path)), path.open("rb") as file:
-        _begun(file, size)
+def refused(paths: Mapping[Path, Path], size: tuple[int, int]) -> dict[Path, InputError]:
+    """Errors of the maps (by left image, as :func:`find` gives them) that :func:`decode` refuses by their headers."""
+    errors = dict[Path, InputError]()
+    for left, path in paths.items():
+        try:
+            with _refusal(str(path)), path.open("rb") as file:
+                _unpacker(file, size)
+        except InputError as error:
+            errors[left] = error
+    return errors
 
 
 @contextmanager
-def _told(name: str) -> Iterator[None]:
-    """Errors while a map is read name it; parsers of a damaged file warn and raise anything."""
+def _refusal(name: str) -> Iterator[None]:
+    """Turn any error while a map is read into one that names it; parsers of a damaged file warn and raise anything."""
     try:
         with catch_warnings(action="ignore"):
             yield
@@ -65,8 +71,8 @@ def _told(name: str) -> Iterator[None]:
         raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
 
 
-def _begun(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """Check the header of a map; what unpacks its values."""
+def _unpacker(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
+    """Check the header of a map of this width and height; return the function that unpacks its values."""
     magic = file.read(6)
     file.seek(0)
     # First bytes of NumPy's files.
@@ -83,7 +89,7 @@ def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> No
 
 
 def _numpy(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """An array of NumPy, without execution of any content, and without more memory than the file has."""
+    """Unpacker of NumPy's array, without execution of any content, and without more memory than the file has."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
     shape = tuple(side for side in shape if side != 1)  # networks have one channel, and one image a batch
@@ -93,7 +99,7 @@ def _numpy(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
 
 
 def _image(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """An image of disparities."""
+    """Unpacker of an image of disparities."""
     image = opened(file)
     if image is None:
         raise ValueError("it is of no kind that is read")
@@ -170,17 +176,19 @@ def disparity_stage(
     digests: Mapping[str, str],
     paths: Mapping[str, str],
 ) -> Bundle[ImageFacts]:
-    """Disparities of a left image that another program wrote; unknown everywhere if its file is damaged."""
-    arrays: dict[str, AnyArray] = {}
+    """Disparities of a left image that another program wrote; unknown everywhere if a file is damaged."""
     meta: ImageFacts = {"frame": frame, "camera": "left"}
+    wanted, arrays = (size[0], size[1]), dict[str, AnyArray]()
     for array, digest in digests.items():
         path = Path(paths[array])
         data = files.read_unchanged(path, digest, f"frame {frame}, map {path}")
         try:
             # Without its folder, which is not in the task's key.
-            arrays[array] = decode(data, (size[0], size[1]), path.name)
+            arrays[array] = decode(data, wanted, path.name)
         except InputError as error:
-            arrays[array], meta["damage"] = np.full(size[::-1], np.nan, np.float32), error.message
+            meta["damage"] = error.message
+    if "damage" in meta:
+        arrays = {array: np.full(wanted[::-1], np.nan, np.float32) for array in digests}
     if sign == "left-right":
         arrays["column_disparity"] *= -1
     if sigma is not None:

@@ -78,7 +78,8 @@ def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequen
     if manifest.truth_disparity is not None:
         exact, absent = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
         note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
-        note += f" {len(pairs) - len(absent)} of {len(pairs)} pairs" if absent else ""
+        if absent:
+            note += f" {len(pairs) - len(absent)} of {len(pairs)} pairs: {next(iter(absent.values()))}"
 
         def judged(frame: int) -> Source | None:
             return None if frame in absent else exact(frame)
@@ -165,14 +166,8 @@ def _disparity(
         maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
     common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
-    bad = dict[Path, InputError]()
-    for of in maps.values():
-        for left, path in of.items():
-            try:
-                disparities.check_header(path, size)
-            except InputError as error:
-                bad[left] = error
-    if bad and len(bad) == len(set.intersection(*(set(of) for of in maps.values()))):
+    bad = {left: error for of in maps.values() for left, error in disparities.refused(of, size).items()}
+    if bad and not set.intersection(*map(set, maps.values())) - bad.keys():
         raise next(iter(bad.values()))
 
     def source(frame: int) -> Source:

@@ -80,6 +80,8 @@ def disparity_accuracy_stage(
     error = np.where(match, column - true, np.float32(np.nan))
     facts: MetricsFacts = {"metrics": disparity_accuracy(column, match, sigma, true)}
     wrong = facts["metrics"]["bad_2_matched"]["value"]
+    if "damage" in truth.meta:
+        facts["warnings"] = [f"{truth.meta['damage']}: its pair is not judged"]
     # Most right matches fit right truth. Fewer than 100 pixels do not raise the doubt.
     if np.count_nonzero(np.isfinite(error)) >= 100 and isinstance(wrong, float) and wrong > 0.75:
         facts["warnings"] = [

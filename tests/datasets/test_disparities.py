@@ -278,9 +278,10 @@ def test_a_bad_map_costs_its_own_pair_alone(tmp_path, materialise):
         open_manifest(tmp_path / "rover.rille.toml", Digests())
 
 
-def test_a_map_that_is_damaged_behind_its_header_is_empty(tmp_path, materialise):
-    sequence(tmp_path, 'left = "disp/*.npy"\nsigma = 0.5')
-    file = tmp_path / "disp" / "01.npy"
+@pytest.mark.parametrize(("folder", "sigma"), [("disp", "0.5"), ("sigma", '"sigma/*.npy"')])
+def test_a_map_that_is_damaged_behind_its_header_is_empty(tmp_path, materialise, folder, sigma):
+    sequence(tmp_path, f'left = "disp/*.npy"\nsigma = {sigma}')
+    file = tmp_path / folder / "01.npy"
     file.write_bytes(file.read_bytes()[:-8])
     s = open_manifest(tmp_path / "rover.rille.toml", Digests())
     assert not s.lost

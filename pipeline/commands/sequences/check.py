@@ -134,8 +134,9 @@ class Inspection:
         images = {(frame, camera): self.make.raw_image(frame, camera) for frame in self.frames for camera in CAMERAS}
         seen = {frame: self.make.quality(frame) for frame in self.frames}
         maps = {(k, "map"): given for k in self.frames if (given := self.make.given_disparity(k)) is not None}
-        yield Maybe([*images.values(), *maps.values(), *seen.values()])
-        for at, handle in (images | maps).items():
+        opened = images | maps
+        yield Maybe([*opened.values(), *seen.values()])
+        for at, handle in opened.items():
             try:
                 if handle.ref is None:
                     raise _cause(handle)
@@ -150,8 +151,8 @@ class Inspection:
         # More are only counted.
         for refusal in errors[:3]:
             self.refused(refusal, "images")
-        count = f"{len(images) + len(maps)} images{' and maps' if maps else ''}"
-        text = f"{len(errors)} of {count} cannot be used" if errors else f"all {len(images) + len(maps)} open"
+        kinds = "images and maps" if maps else "images"
+        text = f"{len(errors)} of {len(opened)} {kinds} cannot be used" if errors else f"all {len(opened)} open"
         self.say(judge.judge("images", text, {"unusable": len(errors)}))
         # As the cameras took them: one image is two when the lenses of two cameras are taken out of it. Images of one
         # grey value do not count as repeated.

@@ -62,3 +62,13 @@ def test_truth_that_contradicts_the_matches_is_named(read, misread):
     found = {"column_disparity": true + np.float32(0.1), "disparity_std": np.full_like(true, 0.1), "validity": bits}
     bundles = {"disparity": Bundle(found, {}), "truth": Bundle({"column_disparity": read(true)}, {})}
     assert ("warnings" in disparity_accuracy_stage.run(NoParams(), {}, bundles).meta) == misread
+
+
+def test_a_damaged_map_of_truth_judges_nothing_and_is_named():
+    column = np.full((4, 5), -8, np.float32)
+    bits = np.full(column.shape, Validity.MATCHED, np.uint8)
+    disparity = Bundle({"column_disparity": column, "disparity_std": column * 0 + 1, "validity": bits}, {})
+    truth = Bundle({"column_disparity": column * NAN}, {"damage": "1.npy cannot be read"})
+    out = disparity_accuracy_stage.run(NoParams(), {}, {"disparity": disparity, "truth": truth})
+    assert out.meta["metrics"]["bad_2"]["value"] is None
+    assert out.meta["warnings"] == ["1.npy cannot be read: its pair is not judged"]
