@@ -26,7 +26,7 @@ from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import bag
 from rille.datasets.images.files import Digests, check_size
 from rille.datasets.images.headers import Header, sizes_of
-from rille.datasets.images.pairing import join, two_sides
+from rille.datasets.images.simultaneous import join
 from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
 from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
 from rille.datasets.inspection.views import FoundImages
@@ -36,6 +36,7 @@ from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
 from rille.datasets.text.reading import SMALL, open_regular
+from rille.datasets.text.sides import two_sides
 from rille.datasets.text.times import seconds
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import NoParams

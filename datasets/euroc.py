@@ -17,11 +17,11 @@ from pathlib import Path
 from rille.datasets.cameras import read_cameras
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.images.files import Digests
-from rille.datasets.images.pairing import stamp_of
 from rille.datasets.manifest.model import Cameras, Images, Imu, Manifest, Times, Truth
 from rille.datasets.manifest.opening import open_folder
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name
+from rille.datasets.text.order import stamp_of
 from rille.stages.core.errors import InputError, warning
 from rille.stages.geometry.geometry import RigidTransform
 

@@ -19,7 +19,6 @@ from rille.datasets.images.files import Digests
 from rille.datasets.images.kinds import hints
 from rille.datasets.images.masks import masked
 from rille.datasets.images.misalign import MisalignParams, misalign
-from rille.datasets.images.pairing import of_one_camera
 from rille.datasets.images.samples import examined
 from rille.datasets.manifest.opening import open_manifest
 from rille.datasets.mockup.params import SHORT, MockupParams, SetupParams
@@ -28,6 +27,7 @@ from rille.datasets.mockup.sequence import LOOP, mockup, mockup_loop
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import shell_word
 from rille.datasets.text.reading import WILD, Search, missing_target
+from rille.datasets.text.sides import of_one_camera
 from rille.datasets.text.validation import Model, validated
 from rille.stages.core.errors import ConfigError, InputError, RilleError, did_you_mean
 

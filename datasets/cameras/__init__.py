@@ -15,9 +15,9 @@ from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera
 from rille.datasets.cameras.pair import rig_of
 from rille.datasets.cameras.text import parse_nested
-from rille.datasets.images.pairing import side_of
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.reading import read_text, refuse_decimal_commas
+from rille.datasets.text.sides import side_of
 from rille.stages.core.errors import InputError
 from rille.stages.geometry.geometry import RigidTransform
 

@@ -18,8 +18,8 @@ from rille.datasets.cameras.kitti import LEAST_FOCAL
 from rille.datasets.cameras.model import UNKNOWN_SIZE, CalibratedCamera, parallel, stereo_cameras
 from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
-from rille.datasets.images.pairing import two_sides
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.sides import two_sides
 from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens

@@ -10,8 +10,8 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields, flattened
 from rille.datasets.cameras.model import CalibratedCamera
-from rille.datasets.images.pairing import side_of
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.sides import side_of
 from rille.stages.core.arrays import Floats
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens

@@ -11,7 +11,7 @@ import numpy as np
 
 from rille.datasets.cameras.fields import Fields, by_count, flattened
 from rille.datasets.cameras.model import CalibratedCamera, parallel, stereo_cameras
-from rille.datasets.images.pairing import natural
+from rille.datasets.text.order import natural
 from rille.datasets.text.reading import read_text
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rille.datasets.images import chessboard, pairing
 from rille.datasets.images.files import SUFFIXES, read_grey
 from rille.datasets.protocol import CAMERAS
+from rille.datasets.text.sides import side_of
 from rille.stages.calibration.target import LEAST_VIEWS, BoardView
 from rille.stages.core.errors import InputError, told
 from rille.stages.geometry.geometry import Sizes
@@ -53,7 +54,7 @@ def image_files(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     """Image files of both sides; one folder may serve both if the names tell the sides."""
     lefts, rights = images_of(left), images_of(right)
     if left == right:
-        sides = {path: (pairing.side_of(path.stem) or (0, -1))[1] for path in lefts}
+        sides = {path: (side_of(path.stem) or (0, -1))[1] for path in lefts}
         lefts, rights = ([path for path in lefts if sides[path] == side] for side in (0, 1))
         if not (lefts and rights):
             text = f"the names in {left} do not tell left from right"

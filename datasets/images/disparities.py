@@ -18,8 +18,10 @@ import numpy as np
 from rille.datasets.facts import ImageFacts
 from rille.datasets.images import files
 from rille.datasets.images.headers import opened
-from rille.datasets.images.pairing import ends, natural, without_side
+from rille.datasets.text.names import ends
+from rille.datasets.text.order import natural
 from rille.datasets.text.reading import Search
+from rille.datasets.text.sides import without_side
 from rille.stages.core.arrays import Floats32
 from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, within

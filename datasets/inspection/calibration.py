@@ -11,10 +11,10 @@ import numpy as np
 
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size, relative_pose
-from rille.datasets.images import pairing
 from rille.datasets.images.kinds import line
 from rille.datasets.inspection.tables import TABLES
 from rille.datasets.inspection.views import FoundImages, relative
+from rille.datasets.text.sides import two_sides
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes
 
@@ -74,7 +74,7 @@ def find_calibration(folder: Path, texts: list[Path], views: FoundImages) -> Cal
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     # Cameras of other names differ by the same words as their images.
     renamed = {name: _of_other_side(name, views.sides) for name in single}
-    pairs = pairing.two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
+    pairs = two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
     candidates += [_calibration(pair, [single[name] for name in pair], views.sides) for pair in pairs]
     if not candidates:
         return Calibrations(None, [], unread)

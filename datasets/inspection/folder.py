@@ -16,14 +16,15 @@ from rille.datasets.cameras import KNOWN
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.headers import located
 from rille.datasets.images.kinds import hints, line, unread
-from rille.datasets.images.pairing import UNWRITABLE, natural, side_of, writable
 from rille.datasets.inspection.calibration import CALIBRATIONS, FoundCalibration, find_calibration
 from rille.datasets.inspection.tables import CAMERA_WORDS, TABLES, table_kind
 from rille.datasets.inspection.views import COMPUTED, DEPTH, FoundImages, find_views, relative
 from rille.datasets.manifest.model import VEHICLE_FILE, stated_vehicle
 from rille.datasets.protocol import CAMERAS
-from rille.datasets.text.names import shell_word
+from rille.datasets.text.names import UNWRITABLE, shell_word, writable
+from rille.datasets.text.order import natural
 from rille.datasets.text.reading import Search, is_file, read_text, read_toml
+from rille.datasets.text.sides import side_of
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
 from rille.stages.hazard.vehicle import Vehicle

@@ -16,8 +16,10 @@ from rille.datasets.images import pairing
 from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import split
-from rille.datasets.images.pairing import ImagePair, natural, of_one_camera, side_of
+from rille.datasets.images.pairing import ImagePair
 from rille.datasets.text.names import shell_word
+from rille.datasets.text.order import natural, times_in_names
+from rille.datasets.text.sides import CAMERA_NUMBER, SIDES, by_one_word, of_one_camera, side_of
 from rille.stages.core.errors import InputError
 from rille.stages.core.quantities import count
 from rille.stages.geometry.geometry import Sizes
@@ -81,7 +83,7 @@ def _by_token(images: list[Path], names: list[str]) -> Sets:
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
         # Two sets in one folder: day1_left_07 and day2_left_07.
-        words = {neutrals[i]: word for word, of in pairing.by_one_word(neutrals).items() for i in of}
+        words = {neutrals[i]: word for word, of in by_one_word(neutrals).items() for i in of}
         for neutral, side, path in found:
             groups[row, f"{place} {words.get(neutral, '')}"][side].append(path)
     return groups
@@ -106,10 +108,10 @@ def _by_word(images: list[Path], names: list[str], both: Sets) -> dict[str, list
     # Tokens that make single pairs, and numbers that leave images over or stand in folders of numbered cameras, may be
     # numbers of frames: A/image_0 to A/image_2, B/image_0 to B/image_2.
     numbers = sum(len(of) for sides in both.values() for of in sides) < len(images)
-    numbers |= all(pairing.CAMERA_NUMBER.search(name.rpartition("/")[0]) for name in names)
-    if any(min(map(len, of)) > 1 and not (numbers and pairing.SIDES[k][0][-1] == "0") for (k, _), of in both.items()):
+    numbers |= all(CAMERA_NUMBER.search(name.rpartition("/")[0]) for name in names)
+    if any(min(map(len, of)) > 1 and not (numbers and SIDES[k][0][-1] == "0") for (k, _), of in both.items()):
         return {}
-    words = pairing.by_one_word(names) or pairing.by_one_word(names, timed=True)
+    words = by_one_word(names) or by_one_word(names, timed=True)
     parts = {word: [images[i] for i in of] for word, of in words.items()}
     lefts = {path for left, _ in both.values() for path in left}
     return {} if both and any(lefts <= set(of) for of in parts.values()) else parts
@@ -131,7 +133,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     InputError
         Names do not distinguish the images of two cameras.
     """
-    lines, tokens = list[str](), pairing.SIDES
+    lines, tokens = list[str](), SIDES
     photographs = [path for path in images if not COMPUTED.search(relative(path, folder))]
     both, parts, counts = _sets(folder, photographs)
     if not both and not parts:
@@ -176,7 +178,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
         sizes,
         f"{len(left)} left and {len(right)} right images, told apart by {sides[0]!r} and {sides[1]!r}",
         trouble,
-        bool(pairing.times_in_names([pair.left for pair in matched])),
+        bool(times_in_names([pair.left for pair in matched])),
         sides,
         tuple(pair.absent for pair in matched if pair.absent),
         tuple(lines),

@@ -15,7 +15,7 @@ import numpy as np
 from rille.datasets import protocol
 from rille.datasets.images.disparities import last_number
 from rille.datasets.images.files import SUFFIXES
-from rille.datasets.images.pairing import ImagePair, ends, stamps_of
+from rille.datasets.images.pairing import ImagePair
 from rille.datasets.imu import at_frames, read_imu, sensed
 from rille.datasets.manifest import model
 from rille.datasets.manifest.rig import direction
@@ -30,6 +30,8 @@ from rille.datasets.poses import (
     refuse_apart,
 )
 from rille.datasets.text.columns import columns_of_places, meanings, unread_rotations
+from rille.datasets.text.names import ends
+from rille.datasets.text.order import stamps_of
 from rille.datasets.text.reading import read_lines
 from rille.datasets.text.tables import NUMBER, TextTable, split
 from rille.datasets.text.times import UNITS, of_two, seconds, undated

@@ -19,12 +19,12 @@ from rille.datasets.bags import is_bag, open_bag
 from rille.datasets.cameras.model import RECTIFIED
 from rille.datasets.images import disparities, files
 from rille.datasets.images.headers import sizes_of
-from rille.datasets.images.pairing import ImagePair, common_headers, pair_up, writable
+from rille.datasets.images.pairing import ImagePair, common_headers, pair_up
 from rille.datasets.manifest.model import Cameras, Disparity, DisparityMaps, Images, Manifest, read_manifest
 from rille.datasets.manifest.motion import MotionReader
 from rille.datasets.manifest.rig import read_optics
 from rille.datasets.protocol import Sequence, Source
-from rille.datasets.text.names import derived_name
+from rille.datasets.text.names import derived_name, writable
 from rille.datasets.text.reading import Search, nearest_hint
 from rille.stages.core.declare import NoParams
 from rille.stages.core.errors import IncompleteError, InputError, within

@@ -11,16 +11,10 @@ import numpy as np
 import pytest
 from raising import raises
 
-from rille.datasets.images.pairing import (
-    common_headers,
-    join,
-    natural,
-    pair_up,
-    side_of,
-    stamp_of,
-    times_in_names,
-    two_sides,
-)
+from rille.datasets.images.pairing import common_headers, pair_up
+from rille.datasets.images.simultaneous import join
+from rille.datasets.text.order import natural, stamp_of, times_in_names
+from rille.datasets.text.sides import side_of, two_sides
 
 
 def paths(*names: str) -> list[Path]:

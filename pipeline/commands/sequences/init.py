@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 from rille.datasets.bags import is_bag
-from rille.datasets.images.pairing import writable
 from rille.datasets.inspection.folder import Findings, inspect
 from rille.datasets.manifest.model import VEHICLE_FILE
 from rille.datasets.manifest.text import manifest_text, needs, pair_words, size_words
 from rille.datasets.registry import folder_manifest, hindrance
-from rille.datasets.text.names import derived_name, shell_word
+from rille.datasets.text.names import derived_name, shell_word, writable
 from rille.pipeline.engine.runtime import atomic
 from rille.pipeline.runs.options import FLAG, Output, check_new, check_output
 from rille.stages.core.errors import ConfigError, InputError
