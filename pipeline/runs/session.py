@@ -38,7 +38,7 @@ from rille.pipeline.flow import unread
 from rille.pipeline.flow.closed_loop import Drive, dataflow
 from rille.pipeline.report.delivery import lacking, left_out
 from rille.pipeline.runs import part_of_run, run_files
-from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs.checks.records import judge_rig
 from rille.pipeline.runs.lookup import LEDGER, refuse_unknown
 from rille.pipeline.runs.options import COMPLETE, HOLES, Options, Settings, cache_folder
 from rille.stages.core.errors import ConfigError, RilleError, warning, within

@@ -14,8 +14,10 @@ from rille.datasets.protocol import Sequence
 from rille.datasets.registry import open_sequence
 from rille.pipeline.commands.sequences.check import inspect
 from rille.pipeline.flow import config as configuration
-from rille.pipeline.runs import input_checks, session
-from rille.pipeline.runs.input_checks import judge_rig
+from rille.pipeline.runs import session
+from rille.pipeline.runs.checks import matches
+from rille.pipeline.runs.checks.limits import Finding
+from rille.pipeline.runs.checks.records import judge_rig
 from rille.pipeline.runs.options import Settings
 from rille.stages.geometry.geometry import RigidTransform
 from rille.stages.geometry.lens import Lens
@@ -111,7 +113,7 @@ def test_a_cache_that_cannot_be_written_costs_nothing_but_what_it_would_keep(tmp
 
 def test_swapped_folders_fail(tmp_path, capsys, monkeypatch):
     # As with cameras that are turned: their rows do not fit each other when they are exchanged.
-    monkeypatch.setattr(input_checks, "judge_epipolar", lambda facts: input_checks.Finding("", "", "epipolar", "FAIL"))
+    monkeypatch.setattr(matches, "judge_epipolar", lambda facts: Finding("", "", "epipolar", "FAIL"))
     path = folder(tmp_path / "wall")
     (path / "left").rename(path / "old")
     (path / "right").rename(path / "left")

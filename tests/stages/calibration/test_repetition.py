@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rig_scenes import knocked, matches, street_depth, street_rig
 
-from rille.pipeline.runs.input_checks import judge_repetition
+from rille.pipeline.runs.checks.matches import judge_repetition
 from rille.stages.calibration.doubt import repeated
 from rille.stages.calibration.orientation import OrientationParams, orientation_stage
 from rille.stages.calibration.rig import RigParams, orient_rig

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rille.datasets.registry import open_sequence
-from rille.pipeline.runs.input_checks import judge_synchrony
+from rille.pipeline.runs.checks.matches import judge_synchrony
 from rille.stages.calibration import synchrony
 from rille.stages.calibration.synchrony import best_partners
 from rille.stages.core.declare import Bundle, NoParams

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rille.datasets.protocol import Positions, Sequence
-from rille.pipeline.runs import input_checks
+from rille.pipeline.runs.checks import looks, matches, records
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
@@ -26,21 +26,21 @@ def rig(x: float, right: Camera = CAMERA) -> Rig:
 
 @pytest.mark.parametrize(("x", "level"), [(-0.12, "OK"), (-97.0, "WARN"), (-0.001, "WARN"), (0.12, "OK"), (-4.9, "OK")])
 def test_a_baseline_in_another_unit_and_cameras_in_any_order(x, level):
-    assert input_checks.judge_rig(rig(x)).level == level
+    assert records.judge_rig(rig(x)).level == level
 
 
 def test_a_right_camera_upside_down_stands_where_it_stands():
     upside_down = RigidTransform(np.diag([-1.0, -1.0, 1.0]), np.array([0.12, 0.0, 0.0]))
-    assert input_checks.judge_rig(Rig(CAMERA, CAMERA, upside_down)).level == "OK"
+    assert records.judge_rig(Rig(CAMERA, CAMERA, upside_down)).level == "OK"
 
 
 def test_another_camera_is_stated_and_no_mistake():
-    half = input_checks.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
+    half = records.judge_rig(rig(-0.1, Camera(250.0, 250.0, 80.0, 60.0, 160, 120)))
     assert half.level == "OK"
     assert half.text.endswith("500 px, 320 x 240, right 250 px, 160 x 120")
     wide = Camera(500.0, 500.0, 320.0, 120.0, 640, 240)
-    assert input_checks.judge_rig(rig(-0.1, wide)).level == "OK"
-    tele = input_checks.judge_rig(rig(-0.1, Camera(1000.0, 1000.0, 160.0, 120.0, 320, 240)))
+    assert records.judge_rig(rig(-0.1, wide)).level == "OK"
+    tele = records.judge_rig(rig(-0.1, Camera(1000.0, 1000.0, 160.0, 120.0, 320, 240)))
     assert (tele.level, tele.text[-24:]) == ("OK", "right 1000 px, 320 x 240")
 
 
@@ -52,15 +52,15 @@ def recorded(frames: int, **known) -> tuple[Sequence, range]:
 
 def test_times():
     def judged(*times: float):
-        return input_checks.judge_times(*recorded(len(times), times=times))
+        return records.judge_times(*recorded(len(times), times=times))
 
-    assert input_checks.judge_times(*recorded(2)).level == judged(3.0).level == "OK"
+    assert records.judge_times(*recorded(2)).level == judged(3.0).level == "OK"
     assert "10 frames a second over 0.3 s" in judged(0.0, 0.1, 0.2, 0.3).text
     gap = judged(0.0, 0.1, 0.2, 0.6, 0.7)
     assert gap.level == "WARN"
     assert "0.4 s from frame 2 to 3" in gap.text
     some = recorded(8, times=tuple(0.1 * k for k in range(8)))[0]
-    assert "0.4 s from frame 2 to 6" in input_checks.judge_times(some, [0, 1, 2, 6, 7]).text
+    assert "0.4 s from frame 2 to 6" in records.judge_times(some, [0, 1, 2, 6, 7]).text
     back = judged(0.0, 0.1, 0.1, 0.2)
     assert back.level == "FAIL"
     assert "frame 1 to 2" in back.text
@@ -71,13 +71,13 @@ def poses(count: int) -> list[RigidTransform]:
 
 
 def test_truth_coverage_and_length():
-    assert "none" in input_checks.judge_truth(*recorded(1)).text
+    assert "none" in records.judge_truth(*recorded(1)).text
     places = Positions(((0.0, 0.0), (3.0, 4.0)), (0.0, 1.0))
-    alone = input_checks.judge_truth(*recorded(4, truth_positions=places))
+    alone = records.judge_truth(*recorded(4, truth_positions=places))
     assert (alone.level, "positions only" in alone.text, "5 m" in alone.text) == ("OK", True, True)
-    full = input_checks.judge_truth(*recorded(4, truth=poses(4)))
+    full = records.judge_truth(*recorded(4, truth=poses(4)))
     assert (full.level, full.text) == ("OK", "4 of 4 frames, 6 m")
-    part = input_checks.judge_truth(*recorded(4, truth=[*poses(3), None]))
+    part = records.judge_truth(*recorded(4, truth=[*poses(3), None]))
     assert part.level == "WARN"
     assert "3 of 4" in part.text
 
@@ -90,7 +90,7 @@ def test_attitude_against_truth():
     inverse = [tuple(map(tuple, T.rotation.T)) for T in truth]
 
     def judged(attitude):
-        return input_checks.judge_attitude(*recorded(4, truth=truth, attitude=attitude))
+        return records.judge_attitude(*recorded(4, truth=truth, attitude=attitude))
 
     assert judged(None) is None
     assert judged(right).level == "OK"
@@ -118,10 +118,10 @@ def ahead(*z: float | None) -> list[RigidTransform | None]:
 )
 def test_odometry_has_a_length_and_a_speed(z, times, level, words):
     known = {"odometry": ahead(*z), "truth": ahead(0.0, 1.0, 2.0), "times": times}
-    found = input_checks.judge_odometry(*recorded(3, **known))
+    found = records.judge_odometry(*recorded(3, **known))
     assert found.level == level
     assert words in found.text
-    assert input_checks.judge_odometry(*recorded(3, times=times)) is None
+    assert records.judge_odometry(*recorded(3, times=times)) is None
 
 
 @pytest.mark.parametrize(
@@ -136,21 +136,21 @@ def test_odometry_has_a_length_and_a_speed(z, times, level, words):
 def test_positions_are_counted_within_the_time_of_the_images(change, level, words):
     measured = {"times": [0.5 * k for k in range(6)], "positions": [[k, 0.0] for k in range(6)], "sigma": [0.1] * 3}
     known = {"priors": {"positions": {**measured, **change}}, "times": (0.0, 1.0, 2.0)}
-    found = input_checks.judge_positions(*recorded(3, **known))
+    found = records.judge_positions(*recorded(3, **known))
     assert found.level == level
     assert words in found.text
-    assert input_checks.judge_positions(*recorded(3)) is None
+    assert records.judge_positions(*recorded(3)) is None
 
 
 def test_up_is_stated():
-    assert input_checks.judge_up(*recorded(1)) is None
-    assert input_checks.judge_up(*recorded(1, up=[(0.0, -1.0, 0.0)])).level == "OK"
-    turned = input_checks.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)]))  # of a camera that is mounted upside down
+    assert records.judge_up(*recorded(1)) is None
+    assert records.judge_up(*recorded(1, up=[(0.0, -1.0, 0.0)])).level == "OK"
+    turned = records.judge_up(*recorded(1, up=[(0.0, 1.0, 0.0)]))  # of a camera that is mounted upside down
     assert (turned.level, turned.text.split("; ")[1]) == ("OK", "it points down in the images")
-    assert input_checks.judge_up(*recorded(1, up=[None])).level == "WARN"
+    assert records.judge_up(*recorded(1, up=[None])).level == "WARN"
 
 
-def looks(left: list[dict[str, float]], right: list[dict[str, float]]):
+def cameras(left: list[dict[str, float]], right: list[dict[str, float]]):
     return {"left": dict(enumerate(left)), "right": dict(enumerate(right))}
 
 
@@ -163,7 +163,7 @@ def changed(**values: float) -> dict[str, float]:
 
 
 def test_good_images_give_two_lines():
-    assert levels(input_checks.judge_looks(looks([GOOD] * 5, [GOOD] * 5), NAMES, LIMITS)) == ["OK", "OK"]
+    assert levels(looks.judge_looks(cameras([GOOD] * 5, [GOOD] * 5), NAMES, LIMITS)) == ["OK", "OK"]
 
 
 @pytest.mark.parametrize(
@@ -184,19 +184,19 @@ def test_good_images_give_two_lines():
     ],
 )
 def test_bad_images_are_told(left, right, level, words):
-    found = input_checks.judge_looks(looks(left, right), NAMES, LIMITS)
+    found = looks.judge_looks(cameras(left, right), NAMES, LIMITS)
     assert any(v.level == level and words in v.text for v in found)
 
 
 def test_an_image_that_shows_nothing_tells_of_no_exposure():
     black = changed(mean=0.0, deviation=0.0)
-    found = input_checks.judge_looks(looks([GOOD, GOOD, black, GOOD, GOOD], [GOOD] * 5), NAMES, LIMITS)
+    found = looks.judge_looks(cameras([GOOD, GOOD, black, GOOD, GOOD], [GOOD] * 5), NAMES, LIMITS)
     assert [bad.code for bad in found if bad.level != "OK"] == ["RIL-650"]
 
 
 @pytest.mark.parametrize(("share", "level"), [(0.0, "OK"), (0.2, "WARN"), (0.97, "FAIL")])
 def test_sides(share, level):
-    assert input_checks.judge_sides(share).level == level
+    assert matches.judge_sides(share).level == level
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_sides(share, level):
     [(0, 0, "OK", ""), (1, 1, "WARN", "773"), (4, 0, "WARN", "773"), (4, 4, "FAIL", "659")],
 )
 def test_pairs_unlike_the_others(unlike, swapped, level, code):
-    found = input_checks.judge_pairs(dict.fromkeys(range(unlike), "why"), 6, swapped, NAMES)
+    found = matches.judge_pairs(dict.fromkeys(range(unlike), "why"), 6, swapped, NAMES)
     assert found.level == level
     assert code in found.code
 
@@ -227,34 +227,34 @@ def facts(before: float, after: float, offset: float = 0.0, turn: float = 0.1):
     ],
 )
 def test_epipolar(given, level, words):
-    found = input_checks.judge_epipolar(given)
+    found = matches.judge_epipolar(given)
     assert found.level == level
     assert words in str(found)
 
 
 def test_matching():
     depths = np.linspace(2.0, 4.0, 101)
-    good = input_checks.judge_matching(0.7, depths, 0.1)
+    good = matches.judge_matching(0.7, depths, 0.1)
     assert good.level == "OK"
     assert "depth 2.1 to 3.9 m, median 3 m" in good.text
-    assert input_checks.judge_matching(0.1, depths, 0.1).level == "WARN"
-    assert input_checks.judge_matching(0.001, depths, 0.1).level == "FAIL"
-    none = input_checks.judge_matching(None, depths[:0], 0.1)
+    assert matches.judge_matching(0.1, depths, 0.1).level == "WARN"
+    assert matches.judge_matching(0.001, depths, 0.1).level == "FAIL"
+    none = matches.judge_matching(None, depths[:0], 0.1)
     assert none.level == "FAIL"
     assert "nan" not in str(none)
-    assert input_checks.judge_matching(0.7, 100 * depths, 0.1).level == "WARN"
+    assert matches.judge_matching(0.7, 100 * depths, 0.1).level == "WARN"
 
 
 def test_maps_that_the_images_do_not_bear_out_are_named():
-    found = input_checks.judge_matching(0.0, np.zeros(0), 0.1, given=True)
+    found = matches.judge_matching(0.0, np.zeros(0), 0.1, given=True)
     assert (found.level, found.code) == ("FAIL", "RIL-907")
-    assert input_checks.judge_matching(0.7, np.ones(9), 0.1, given=True).level == "OK"
+    assert matches.judge_matching(0.7, np.ones(9), 0.1, given=True).level == "OK"
 
 
 @pytest.mark.parametrize(("overlap", "level"), [(0.8, "OK"), (0.3, "WARN"), (0.05, "FAIL"), (None, "FAIL")])
 def test_motion(overlap, level):
     motions = {(0, 1): {"overlap": 0.8, "median_length": 12.0}, (1, 2): {"overlap": overlap, "median_length": None}}
-    found = input_checks.judge_motion(motions, NAMES)
+    found = matches.judge_motion(motions, NAMES)
     assert found.level == level
     assert "12.0 px" in found.text
 
@@ -263,8 +263,8 @@ def test_motion(overlap, level):
 def test_images_that_stand_still_are_named(largest, code):
     """As those are on which the dots of a projector move along with the camera."""
     motions = {(k, k + 1): {"overlap": 0.98, "median_length": v} for k, v in enumerate((0.1, largest))}
-    assert input_checks.judge_motion(motions, NAMES).code == code
+    assert matches.judge_motion(motions, NAMES).code == code
 
 
 def test_one_frame_has_no_motion():
-    assert input_checks.judge_motion({}, NAMES).level == "OK"
+    assert matches.judge_motion({}, NAMES).level == "OK"

@@ -1,0 +1,1 @@
+"""What is wrong with a sequence before it is reconstructed: ``rille check``."""
