@@ -38,7 +38,7 @@ MIN_RIGID_SHARE = 0.75
 .82; photographs of a chess board, matched in part, .71 to .97."""
 
 MAX_REPEATED_SHARE = 0.5
-"""Share of matches that look as well elsewhere above which a pair is doubtful. Right pairs reach .34, a board .86."""
+"""Share of matches that look as well elsewhere above which a pair is doubtful. Right pairs reach .1, a board .95."""
 
 MIN_MATCHED_SHARE = 0.05
 """Share of matched pixels below which two images seem unrelated; unrelated ones have less."""
@@ -116,11 +116,11 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         )
         j, i = np.ogrid[y0 : y1 + 1, x0 : x1 + 1]
         # Without lines: the row through the match.
-        line = (0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0)
-        here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX * np.hypot(line[0], line[1])
-        away = (j - q) ** 2 + (i - p) ** 2
+        line = np.array((0.0, 1.0, -float(q)) if f is None else f @ (x, y, 1.0))
+        line /= np.hypot(line[0], line[1])
+        here = np.abs(line[0] * i + line[1] * j + line[2]) <= MAX_LINE_DISTANCE_PX
         # The match is rounded: its peak may lie beside it.
-        beside = away <= 2**2
+        beside = (j - q) ** 2 + (i - p) ** 2 <= 2**2
         # To save time only the strip that holds these pixels is correlated.
         strip = tuple(slice(k.min(), k.max() + 1) for k in np.nonzero(here | beside))
         around = b[y0 - PATCH_RADIUS_PX : y1 + PATCH_RADIUS_PX + 1, x0 - PATCH_RADIUS_PX : x1 + PATCH_RADIUS_PX + 1]
@@ -128,13 +128,25 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
         score = cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED)
         own = float(score[beside[strip]].max())
         # 0.7: least correlation of a match that can be judged.
-        if not np.isfinite(own) or own < 0.7:
-            continue
-        # 8 pixels: least distance from the match of a similar patch that counts.
-        elsewhere = score[(here & (away >= 8**2))[strip]]
-        # 0.05: largest difference of its correlation from that of the match.
-        looks_alike.append(elsewhere.size > 0 and float(elsewhere.max()) >= own - 0.05)
+        if np.isfinite(own) and own >= 0.7:
+            along = np.rint(line[0] * (j - q) - line[1] * (i - p)).astype(int)
+            looks_alike.append(_recurs(score[here[strip]], along[here], own))
     return float(np.mean(looks_alike)) if len(looks_alike) >= MIN_MATCHES // 4 else 0.0
+
+
+def _recurs(score: Floats32, along: AnyArray, own: float) -> bool:
+    """Whether a correlation of ``own`` recurs beyond a place of lesser correlation; ``score`` (n,) of pixels that lie
+    ``along`` a line, pixels from the match. An edge that follows the line correlates all along: it does not repeat."""
+    profile = np.full(2 * int(np.abs(along).max(initial=0)) + 1, -1.0)
+    middle = len(profile) // 2
+    np.maximum.at(profile, middle + along, score)
+    for side in (profile[middle:], profile[middle::-1]):
+        # 0.05 and 0.2: differences of correlation that count as none, and as that of another thing.
+        # 8 pixels: least distance of a similar patch.
+        lesser = np.minimum.accumulate(side) < own - 0.2
+        if (lesser & (side >= own - 0.05))[8:].any():
+            return True
+    return False
 
 
 def _as_left(

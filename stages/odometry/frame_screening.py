@@ -29,9 +29,9 @@ from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
 from rille.stages.imaging.image_quality import (
-    ALONG,
     MAX_DARK_GREY,
     MIN_BRIGHT_GREY,
+    blurs,
     drowned,
     faint,
     grey_rows,
@@ -62,8 +62,8 @@ class FrameScreeningParams(Params):
     ----------
     uniform : standard deviation [grey levels] over an image below which the frame counts as blank; image noise has
         about 1.
-    blurred : share of the camera's usual sharpness below which a pair cannot be a basic pair; a Gaussian blur of one
-        pixel costs 0.4.
+    blurred : share of the sharpness of the images around below which a pair cannot be a basic pair; a Gaussian blur of
+        one pixel costs 0.4.
     jump : change of the displacements between two steps, both in pixels and in multiples of the lower quartile, from
         which on the frames there are tested for images that are swapped or not of one time.
     """
@@ -153,13 +153,10 @@ def _see(
     out: Judgement, frames: Sequence[int], qualities: Mapping[int, Mapping[str, Any]], params: FrameScreeningParams
 ) -> None:
     """Judge frames by their images alone: uniform, blurred, copied."""
-    limits = {**dict.fromkeys(ALONG, params.blurred), "detail": 0.5 * params.blurred}
     for side in SIDES:
-        # Noise is sharper than any photograph.
-        shown = [seen for f in frames if not drowned(seen := qualities[f][side])]
-        usual = {what: _usual([seen[what] for seen in shown]) for what in limits}
-        for f in frames:
-            seen = qualities[f][side]
+        looks = [qualities[f][side] for f in frames]
+        noisy = [drowned(seen) for seen in looks]
+        for f, seen, blur in zip(frames, looks, blurs(looks), strict=True):
             if seen["deviation"] < params.uniform:
                 kind = "empty" if seen["mean"] is None else next(word for up, word in GREYS if seen["mean"] <= up)
                 words = seen.get("damage") or (
@@ -170,13 +167,10 @@ def _see(
             if noise_alone(seen):
                 (out.lost if side == "left" else out.unfit).setdefault(f, f"{side} image of noise alone")
                 continue
-            if drowned(seen) and shown:
+            if drowned(seen) and not all(noisy):
                 out.unfit.setdefault(f, f"{side} image drowned in noise, unlike others")
-            for what, limit in limits.items():
-                share = seen[what] / usual[what] if seen[what] is not None and usual[what] > 0 else 1.0
-                if share < limit:
-                    words = what.replace("_", " along the ")
-                    out.unfit.setdefault(f, f"blurred {side} image ({share:.0%} of the usual {words})")
+            if blur.share < params.blurred:
+                out.unfit.setdefault(f, f"blurred {side} image ({blur.words})")
     digests = {f: [qualities[f][side]["digest"] for side in SIDES] for f in frames}
     for f in frames:
         if digests[f][0] == digests[f][1] and f not in out.lost:
@@ -189,11 +183,6 @@ def _see(
             out.repeated.append((a, b))
         if len(same) == 1:
             out.unfit.setdefault(b, f"its {same[0]} image is that of frame {a}")
-
-
-def _usual(values: Sequence[float | None]) -> float:
-    known = [v for v in values if v is not None]
-    return float(np.median(known)) if len(known) > 2 else 0.0
 
 
 def _neighbours(frames: Sequence[int], of: Set[int]) -> set[int]:

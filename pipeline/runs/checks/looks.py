@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.pipeline.runs.checks.limits import Finding, judge
 from rille.stages.core.arrays import Floats
-from rille.stages.imaging.image_quality import faint, grey_rows
+from rille.stages.imaging.image_quality import blurs, faint, grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 Look = Mapping[str, Any]
@@ -65,10 +65,9 @@ def _camera(
         k = int(np.argmax(change))
         text = f"{camera} brightness changes by a factor of {change[k]:.3g} from frame {at[k]} to {at[k + 1]}"
         yield judge("exposure", text, {"change": change[k]})
-    sharpness = _figure(looks, "sharpness")
-    share_of_usual = np.nan_to_num(sharpness / _usual(sharpness), nan=1.0)
-    blurred, k = int((share_of_usual < limits.blurred).sum()), int(np.argmin(share_of_usual))
-    worst = f"the worst frame {at[k]} ({100 * share_of_usual[k]:.0f} % of usual)"
+    of = blurs(list(looks.values()))
+    blurred, k = sum(blur.share < limits.blurred for blur in of), int(np.argmin([blur.share for blur in of]))
+    worst = f"the worst frame {at[k]} ({of[k].words})"
     yield judge("sharpness", f"{blurred} {camera} images are blurred, {worst}", {"blurred": blurred})
 
 

@@ -10,6 +10,7 @@ import pytest
 from rille.datasets.protocol import Positions, Sequence
 from rille.pipeline.runs.checks import looks, matches, records
 from rille.stages.geometry.geometry import Camera, Rig, RigidTransform, rotation_exp
+from rille.stages.imaging.image_quality import ALONG
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 LIMITS = FrameScreeningParams.model_validate({})
@@ -154,7 +155,7 @@ def cameras(left: list[dict[str, float]], right: list[dict[str, float]]):
     return {"left": dict(enumerate(left)), "right": dict(enumerate(right))}
 
 
-GOOD = {"mean": 100.0, "deviation": 40.0, "dark": 0.0, "bright": 0.0, "sharpness": 1.0}
+GOOD = {"mean": 100.0, "deviation": 40.0, "dark": 0.0, "bright": 0.0, **dict.fromkeys(ALONG, 1.0), "detail": 0.1}
 NAMES = [f"f{k}" for k in range(5)]
 
 
@@ -169,7 +170,7 @@ def test_good_images_give_two_lines():
 @pytest.mark.parametrize(
     ("left", "right", "level", "words"),
     [
-        ([GOOD] * 4 + [changed(sharpness=0.4)], [GOOD] * 5, "WARN", "frame f4 (40 % of usual)"),
+        ([GOOD] * 4 + [changed(sharpness=0.4)], [GOOD] * 5, "WARN", "frame f4 (40% of the usual sharpness)"),
         ([GOOD] * 5, [changed(sharpness=0.5)] * 5, "WARN", "right is 0.50 as sharp"),
         ([GOOD] * 5, [changed(mean=40.0)] * 5, "WARN", "right is 0.40 as bright"),
         ([GOOD] * 3 + [changed(mean=180.0)] * 2, [GOOD] * 5, "WARN", "changes by a factor of 1.8 from frame f2 to f3"),

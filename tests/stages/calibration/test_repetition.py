@@ -49,6 +49,17 @@ def test_a_right_image_that_is_turned_and_scaled_repeats_no_more(scale: float, t
     assert share > 0.8 if rows else share < 0.1
 
 
+def test_edges_along_the_lines_do_not_repeat() -> None:
+    """Stairs: a patch on an edge along its epipolar line looks alike all along, and yet not as of a period."""
+    rng = np.random.default_rng(2)
+    steps = np.repeat(rng.uniform(20, 230, 12), 20)[:, None]
+    scene = (steps + cv2.GaussianBlur(rng.normal(0, 12, (240, 320)), (0, 0), 2.0)).astype(np.float32)
+    y, x = (k.ravel().astype(float) for k in np.mgrid[10:230:6, 30:310:6])
+    f = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    places = np.stack([x, y], 1), np.stack([x - 10, y], 1)
+    assert repeated(scene, np.roll(scene, -10, axis=1), places, f) < 0.1
+
+
 def test_matches_of_what_repeats_repair_no_rig() -> None:
     rig = street_rig()
     pairs = [matches(knocked(rig, pitch_deg=-0.24, roll_deg=0.3), street_depth, pair=k) for k in range(3)]

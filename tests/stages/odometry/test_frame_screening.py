@@ -87,6 +87,14 @@ def test_frames_of_noise_alone_make_no_pairs_however_many_and_blur_none_of_the_o
     }
 
 
+def test_what_a_camera_comes_to_see_is_no_blur():
+    """Level ground before stairs, whose edges are sharp: 0.45 of the sequence's median, never of the images around."""
+    qualities = {k: sight(k, sharpness=min(0.5 + 0.04 * k, 1.2)) for k in range(40)}
+    assert not found({}, qualities).unfit
+    qualities[5] = sight(5, sharpness=0.3)
+    assert list(found({}, qualities).unfit) == [5]
+
+
 def test_a_blur_beyond_all_detail_is_told_though_noise_looks_sharp():
     qualities = {k: sight(k) for k in range(7)} | {3: sight(3, detail=0.02, sharpness=0.9)}
     assert found({}, qualities).unfit == {3: "blurred left image (20% of the usual detail)"}
