@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 from raising import raises
@@ -218,6 +219,22 @@ def test_nothing_is_invented_where_a_box_hides_the_ground() -> None:
     assert hidden.sum() > 50
     deep = hidden & np.roll(hidden, 3, 0) & np.roll(hidden, -3, 0) & np.roll(hidden, 3, 1) & np.roll(hidden, -3, 1)
     assert not np.isfinite(dem.elevation[deep]).any()
+
+
+def test_what_matching_joins_a_stone_to_the_ground_behind_it_with_is_no_ground() -> None:
+    """Disparities as means of windows bend from the top of a box down to what is seen behind it: no jump is left."""
+    low, high = (-0.1, 0.8, -HEIGHT), (0.1, 0.95, -0.5)
+    exact = disparity(RIG, T_LOCAL_LEFT, nearest(plane(0.0, 0.0, -HEIGHT), box(low, high)))[:2]
+    known, blank = np.isfinite(exact[0]), np.full_like(IMAGE, 100.0)
+    weight = np.maximum(cv2.blur(known.astype(np.float32), (5, 5)), 1e-6)
+    column, row = (cv2.blur(np.nan_to_num(m).astype(np.float32), (5, 5)) / weight for m in exact)
+    pair = MatchedPair(blank, Matches(column, row, known), blank)
+    found = np.isfinite(reconstruct(pair, RIG, T_LOCAL_LEFT, LATTICE, (-0.7, -0.3), PARAMS).elevation)
+    ground = on_lattice(np.full(LATTICE.shape, -HEIGHT)).reshape(-1, 3)
+    hidden = (box(low, high)(np.zeros(3), ground) < 1.0 - 1e-6).reshape(LATTICE.shape) & (LATTICE.xy()[..., 1] > 0.97)
+    assert hidden.sum() > 300
+    assert found[hidden].mean() < 0.25
+    assert found[cv2.dilate(hidden.astype(np.uint8), np.ones((15, 15))) == 0].mean() > 0.99
 
 
 def test_elevation_std_is_calibrated() -> None:
