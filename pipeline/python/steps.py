@@ -99,9 +99,10 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
             text = f"the {camera} image is {image.reshape(-1)[:1].tolist()}, no array of pixels"
             raise InputError("RIL-675", text, remedy="read files first: cv2.imread(NAME, cv2.IMREAD_GRAYSCALE), say")
         if image.dtype.kind == "f":
-            low, high = float(np.nanmin(image, initial=0)), float(np.nanmax(image, initial=0))
+            known = image[np.isfinite(image)]
+            low, high = float(known.min(initial=0)), float(known.max(initial=0))
             # From 0 to 1, or with the mean removed and the deviation made 1; 16 bits in floating point.
-            if 0 < high <= 1 or (low < 0 and high - low < 16) or high > 2 * 255:
+            if 0 < high <= 1 or (low < 0 and (high - low < 16 or high == 0)) or high > 2 * 255:
                 text = f"the {camera} image's values lie from {low:.3g} to {high:.3g}: {image.dtype} is taken as 0..255"
                 raise InputError("RIL-973", text, remedy="scale them to 0..255")
     # Images of a sequence are spread as its others are.

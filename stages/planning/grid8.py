@@ -85,7 +85,7 @@ def _flood(ways, number, spans):  # type: ignore[no-untyped-def]
                 i, j = r + dr, c + dc
                 if i < 0 or j < 0 or i >= rows or j >= cols or number[i, j] >= 0:
                     continue
-                # An edge needs its direction at both ends, as in the search below, so that parts are what the search
+                # An edge needs its direction at both ends, as in the search, so that parts are what the search
                 # can join.
                 if ways[r, c] & ways[i, j] & way:
                     number[i, j], stack[size] = count, i * cols + j

@@ -18,7 +18,7 @@ from rille.pipeline.runs import lookup
 from rille.pipeline.runs.options import RUNS, Run, Runs
 from rille.stages.core.quantities import metres, quantity
 
-BEGINS = "another result of equal inputs"
+BEGINS = "another result, the first to differ"
 
 
 def compare(a: Run, b: Run, *, runs: Runs = RUNS) -> None:

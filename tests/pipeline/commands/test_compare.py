@@ -26,7 +26,7 @@ def test_a_failed_task_has_no_result(tmp_path: Path) -> None:
     head, *stages = _tasks(a, b)
     assert head.split(maxsplit=1)[1] == "1 with the same result, 1 with another"
     assert {line.strip() for line in stages} == {
-        "other: 1 another result of equal inputs",
+        "other: 1 another result, the first to differ",
         f"by the manifest, parameters, files or code: rille why {tmp_path.name}/b other",
         "fails: 1 in A alone",
         "more: 1 in B alone",
@@ -46,7 +46,7 @@ def test_where_a_difference_begins_is_said(tmp_path: Path) -> None:
         (runs[-1] / "ledger.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     _, *stages = _tasks(*runs)
     assert [line.strip() for line in stages] == [
-        "mask: 1 another result of equal inputs",
+        "mask: 1 another result, the first to differ",
         "match: 1 another result",
         f"by the manifest, parameters, files or code: rille why {tmp_path.name}/b mask",
     ]
