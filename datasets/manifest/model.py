@@ -187,12 +187,14 @@ class DisparityMaps(Table):
     Attributes
     ----------
     left : pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating
-        point (px; 0, infinite or NaN: unknown), or 16-bit .png (256 a pixel, 0 unknown).
+        point (px; 0, infinite or NaN: unknown), 16-bit .png (256 a pixel, 0 unknown), or other integers.
+    scale : values for a pixel; by default by the kind of file (1, 256), none of other integers.
     sign : left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
         reverse.
     """
 
     left: str
+    scale: float | None = Field(default=None, gt=0, le=1e6)
     sign: Literal["left-right", "right-left"] = "left-right"
 
 
