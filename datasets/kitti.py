@@ -17,7 +17,7 @@ from rille.datasets.cameras import read_cameras
 from rille.datasets.images.files import SUFFIXES, Digests
 from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth, stated_vehicle
 from rille.datasets.manifest.opening import open_folder
-from rille.datasets.manifest.rig import CAR, STREET
+from rille.datasets.manifest.rig import street_defaults
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name, shell_word
 from rille.datasets.text.reading import read_text
@@ -69,7 +69,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     manifest = manifest_of(folder, sides)
     spare = [folder / "times.txt", *([Path(manifest.truth.file)] if manifest.truth else [])]
     sequence = open_folder(manifest, folder, digests, spare)
-    return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
+    return replace(sequence, defaults=street_defaults(sequence.rig))
 
 
 def _of_several(root: Path, number: str | None) -> Path:

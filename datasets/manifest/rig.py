@@ -27,11 +27,11 @@ LONGEST_BASELINE = 20.0
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
 
-STREET = {"locus.cell_size": 0.1}
-"""0.1 m resolves kerbs as far as the disparity does."""
 
-CAR = 0.3
-"""m, least baseline of a rig on a car; for shorter ones the cell size follows from the resolution of the pixels."""
+def street_defaults(rig: Rig) -> dict[str, float]:
+    """Parameters for a rig on a car, by its baseline; of others the cell size follows from the resolution of pixels."""
+    # 0.1 m resolves kerbs as far as the disparity does.
+    return {"locus.cell_size": 0.1} if rig.baseline >= 0.3 else {}
 
 
 @dataclass(frozen=True)

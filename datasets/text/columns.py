@@ -17,7 +17,9 @@ UNTIMED = (*POSITION, "qx", "qy", "qz", "qw")
 """Order of the columns without names, one row a frame."""
 
 WORDS = (
-    (r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?", "time"),
+    (r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|.*[./]stamp([./]secs?)?", "time"),
+    (r"(gps|gnss)?[_. ]?(i?tow|sow|(gps)?sec(ond)?s?[_. ]?of[_. ]?(the[_. ]?)?week|time[_. ]?of[_. ]?week)", "time"),
+    (r"(gps|gnss|gpst)?[_. ]?(week|wn|wno)([_. ]?(no|num|number))?", "week"),
     # ROS tools write the path of a field before its name.
     (r"(.*[./])?(q|r|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])", r"q\3"),
     (r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])", r"\1"),

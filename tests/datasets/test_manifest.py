@@ -1035,6 +1035,15 @@ def test_gps_time_is_not_that_of_the_images(tmp_path, table, more, told):
     assert [("RIL-785" in line, "time_offset = -18" in line) for line in lines] == [(True, True)] * told
 
 
+def test_gps_weeks_are_said_to_be_read_as_utc(tmp_path):
+    write_lines(tmp_path / "p.csv", ["week,tow,x,y", *(f"2123,{44818 + k},{k},0" for k in range(3))])
+    write_lines(tmp_path / "t.txt", [f"{1600000000 + k}" for k in range(3)])
+    text = '[times]\nfile = "t.txt"\n[positions]\nfile = "p.csv"\nsigma = 0.5\n'
+    [line] = opened(write_sequence(tmp_path, text)).warnings
+    assert "RIL-785" in line
+    assert "time_offset = 18" in line
+
+
 def test_positions_may_be_those_of_poses_with_names(tmp_path):
     write_lines(tmp_path / "p.csv", ["time,x,y,z,qx,qy,qz,qw", *(f"{k},{k},{10 * k},0,0,0,0,1" for k in range(3))])
     s = opened(write_sequence(tmp_path, TIMED + '[positions]\nfile = "p.csv"\nsigma = 0.5\n'))
