@@ -242,6 +242,8 @@ class Fields:
         # ROS writes five zeros for cameras without distortion, whatever the model.
         if stated == "fisheye" or (stated and any(coefficients)):
             model = stated
+        if stated == "none" and not coefficients:
+            model, coefficients = "radtan", (0.0,) * 4  # it is said to have none
         if model == "fisheye" and not any(coefficients[4:]):
             coefficients = coefficients[:4]  # RealSense lists five
         return self.lens(key, camera, model, coefficients)

@@ -17,7 +17,7 @@ from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import split
 from rille.datasets.images.pairing import ImagePair
-from rille.datasets.text.names import shell_word
+from rille.datasets.text.names import ends, shell_word
 from rille.datasets.text.order import natural, times_in_names
 from rille.datasets.text.sides import CAMERA_NUMBER, SIDES, by_one_word, of_one_camera, side_of
 from rille.stages.core.errors import InputError
@@ -209,7 +209,8 @@ def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: P
 
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
-    text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
+    seen = f" ({ends(images)})" if images else ""
+    text = f"{folder} holds {len(images)} images{seen}, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
     by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
     remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"

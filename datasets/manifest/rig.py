@@ -229,6 +229,10 @@ def check_baseline(baseline: float, section: RigSection) -> list[str]:
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
     """Warnings about a left and a right camera that are possible but unusual for images of these sizes."""
     lines = []
+    bare = [side for side, camera in zip(("left", "right"), cameras, strict=True) if camera.lens.model == "none"]
+    if len(bare) == 1 and not all(camera.lens.ideal for camera in cameras):
+        text = f"of the {bare[0]} camera no distortion is stated, of the other one it is: it is taken as free of it"
+        lines.append(warning("RIL-812", f"{text}; state its coefficients, or zeros if that is so"))
     for side, calibrated, (width, height) in zip(("left", "right"), cameras, sizes, strict=True):
         c = calibrated.lens.camera
         view = math.degrees(2 * math.atan(width / 2 / c.fx))

@@ -1334,6 +1334,12 @@ def test_rig_of_cameras_without_size(tmp_path):
     assert lenses == {"right": Lens(Camera(500, 500, 320, 240, 320, 200), "radtan", bent)}
 
 
+def test_a_camera_that_is_said_to_have_no_distortion_has_zeros(tmp_path):
+    part = "  intrinsics: [60, 60, 31.5, 23.5]\n  resolution: [64, 48]\n"
+    (tmp_path / "chain.yaml").write_text(f"cam0:\n{part}  distortion_model: none\ncam1:\n{part}")
+    assert [camera.lens.model for camera in read_cameras(tmp_path / "chain.yaml")] == ["radtan", "none"]
+
+
 def test_fisheye_rig_has_the_focal_length_of_its_ideal_camera():
     lens = Lens(Camera(190, 190, 256, 256, 512, 512), "fisheye", (0.0, 0.0, 0.0, 0.0))
     left = CalibratedCamera("a", lens, RigidTransform.identity())

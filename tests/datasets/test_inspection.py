@@ -199,7 +199,7 @@ def test_patterns_escape_what_is_special(tmp_path):
 
 def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path, ["1.png", "2.png"])
-    with raises("RIL-194", "2 images, 0 named as left and 0 as right"):
+    with raises("RIL-194", "2 images (1.png to 2.png), 0 named as left and 0 as right"):
         inspect(tmp_path)
     write_images(tmp_path / "high", ["1.png"], (48, 64))
     with raises("RIL-194", "one above the other, crop=iw:ih/2"):
@@ -376,6 +376,8 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration is not None
     assert (found.calibration.files, found.calibration.cameras) == (("SN1.conf",), 2)
     assert found.calibration.sizes == ((960, 600), (960, 600))
+    assert found.calibration.names == ("left SVGA", "right SVGA")
+    assert found.calibration.among == ("left SVGA", "right SVGA", "left HD", "right HD")
 
 
 def test_scenes_of_two_numbered_cameras_are_sequences_of_their_own(tmp_path):

@@ -214,6 +214,16 @@ def test_cameras_may_differ(tmp_path):
     assert (rig.left.fx, rig.left.fy, rig.right.fx, rig.right.fy, rig.right.cx) == (60, 60, 61, 62, 30)
 
 
+@pytest.mark.parametrize(
+    ("right", "said"), [("", 1), ("distortion = [0, 0, 0, 0]\n", 0), ("distortion = [0.1, 0, 0, 0]\n", 0)]
+)
+def test_a_distortion_of_one_camera_alone_is_said(tmp_path, right, said):
+    figures = "fx = 60.0\ncx = 31.5\ncy = 23.5\n"
+    cameras = f"[cameras.left]\n{figures}distortion = [0.1, 0, 0, 0]\n[cameras.right]\n{figures}{right}"
+    lines = opened(write_sequence(tmp_path, cameras=cameras)).warnings
+    assert ["RIL-812" in line and "right" in line for line in lines] == [True] * said
+
+
 def smaller_right_images(folder: Path) -> Path:
     """A sequence whose left images have 64 x 48 pixels and whose right ones half as many a side."""
     manifest = write_sequence(folder)
