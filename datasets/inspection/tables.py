@@ -20,7 +20,7 @@ ODOMETRY, TRUTH = re.compile("odom|wheel|encoder", re.I), re.compile("truth|(?<!
 
 
 CAMERA_WORDS = re.compile(
-    r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl](_[xy])?\b", re.I
+    r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl]([lr]|_[xy])?\b", re.I
 )
 """In the name or the text of a file that seems to describe cameras."""
 

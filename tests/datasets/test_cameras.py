@@ -421,6 +421,31 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
         rig(("T_x", a.inverse()), ("T_x", b.inverse()), name="camera_")
 
 
+@pytest.mark.parametrize("form", ["okvis", "svo"])
+def test_a_list_of_cameras_says_what_a_chain_says(tmp_path, form):
+    size, optics, bent = [752, 480], [458.6, 457.3, 367.2, 248.4], [-0.28, 0.07, 0.0002, 2e-05]
+    chain, cameras = {}, []
+    for n, at in enumerate((0.0, 0.11)):
+        pose = [1, 0, 0, at, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+        chain[f"cam{n}"] = {"resolution": size, "intrinsics": optics, "distortion_coeffs": bent, "T_BS": pose}
+        if form == "okvis":
+            one = {"T_SC": pose, "image_dimension": size, "focal_length": optics[:2], "principal_point": optics[2:]}
+            one |= {"distortion_coefficients": bent, "distortion_type": "radialtangential"}
+        else:
+            lens = {"type": "radial-tangential", "parameters": {"cols": 1, "rows": 4, "data": bent}}
+            inner = {"image_height": 480, "image_width": 752, "type": "pinhole", "distortion": lens}
+            inner["intrinsics"] = {"cols": 1, "rows": 4, "data": optics}
+            one = {"camera": inner, "T_B_C": {"rows": 4, "cols": 4, "data": pose}}
+        cameras.append(one)
+    wanted = rig_of(*read_cameras(written(tmp_path, json.dumps(chain), "chain.json")))
+    rig, lenses = rig_of(*read_cameras(written(tmp_path, json.dumps({"cameras": cameras}))))
+    assert rig.baseline == pytest.approx(0.11)
+    assert (rig.left, rig.right, lenses) == (wanted[0].left, wanted[0].right, wanted[1])
+    del cameras[1]["focal_length" if form == "okvis" else "camera"]
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, json.dumps({"cameras": cameras})))
+
+
 def test_kalibr_of_one_camera(tmp_path):
     """It stands where the IMU says, or nowhere: in a chain of one camera no link is missing."""
     one = "cam0: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512]{}}}\n"
@@ -710,6 +735,7 @@ T44 = np.block([[ROTATION, SHIFT[:, None]], [np.zeros(3), 1.0]]).tolist()
         (TWO | {"stereo_pose": np.array(T44)[:3].tolist()}, "stereo_pose"),
         (ONE | {"rmat": ROTATION.ravel().tolist(), "baseline": 0.12}, "rmat"),
         (TWO | {"om": [0, 0.1, 0], "T": SHIFT.tolist()}, "om"),
+        ({"calibration_parameters": ONE | {"stereo_transform": {"rotation": [0, 0.1, 0]}}}, "stereo_transform"),
     ],
 )
 def test_a_pose_under_another_key_is_refused_beside_matrices_too(tmp_path, stated, key):
@@ -908,6 +934,16 @@ def test_orbslam2_baseline_times_fx_of_either_sign(tmp_path, bf):
     np.testing.assert_allclose(rig.T_right_left.translation, [-0.234, 0, 0])
     assert rig.left == rig.right == Camera(969, 970, 635.1, 463.5, 1280, 960)
     assert lenses is None
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_stella_vslam_has_the_same_under_other_names(tmp_path, nested):
+    stated = {"fx": 969, "fy": 970, "cx": 635.1, "cy": 463.5, "k1": 0.0, "cols": 1280, "rows": 960}
+    stated["focal_x_baseline"] = 226.746
+    text = json.dumps({"Camera": stated} if nested else {f"Camera.{key}": value for key, value in stated.items()})
+    rig, _ = rig_of(*read_cameras(written(tmp_path, text)))
+    np.testing.assert_allclose(rig.T_right_left.translation, [-0.234, 0, 0])
+    assert rig.left == Camera(969, 970, 635.1, 463.5, 1280, 960)
 
 
 def test_orbslam2_of_one_camera(tmp_path):
