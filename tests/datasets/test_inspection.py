@@ -433,6 +433,29 @@ def test_kinds_of_images_in_turns_are_one_set(tmp_path):
     assert inspect(tmp_path).views.pairs == 5
 
 
+@pytest.mark.parametrize(("name", "lost"), [("{at}_cam{side}_{time}{k}", 1), ("{at}_{side}_{time}{k}", 0)])
+def test_of_two_pairs_of_cameras_in_one_folder_one_is_taken(tmp_path, name, lost):
+    """Their images have times of their own, so that no names are those of both pairs; one lacks an image."""
+    every = [(at, k, side) for at in (("Loc", 17), ("Pan", 18)) for k in range(3) for side in (0, 1)]
+    names = [name.format(at=at[0], time=at[1], side=side, k=k) for at, k, side in every]
+    write_images(tmp_path, [f"{name}.png" for name in names[2 * lost :]] + lost * [f"{names[1]}.png"])
+    views = inspect(tmp_path).views
+    assert (views.left[:3], views.pairs, len(views.absent)) == (("Pan", 3, 0) if lost else ("Loc", 3, 0))
+    assert any("of another set" in line for line in views.others)
+
+
+def test_a_camera_may_be_numbered_behind_the_frame(tmp_path):
+    write_images(tmp_path, [f"img{k:04d}c{camera}.png" for k in range(3) for camera in (0, 1)])
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs) == ("img*c0.png", "img*c1.png", 3)
+
+
+def test_images_and_their_depths_are_no_pairs(tmp_path):
+    write_images(tmp_path, [f"{kind}/{k}.png" for k in range(3) for kind in ("rgb", "depth")])
+    with raises("RIL-194", "6 images"):
+        inspect(tmp_path)
+
+
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):
     days = [f"{day}_{side}_{k}.png" for day in ("day1", "day2") for side in ("left", "right") for k in range(3)]
     write_images(tmp_path, days)
