@@ -280,6 +280,16 @@ def test_tables_are_told_by_content(tmp_path, lines, kind):
     assert table_kind(tmp_path / "table.txt", 2) == kind
 
 
+def test_poses_that_cannot_be_read_are_no_truth_but_are_told(tmp_path):
+    """As Virtual KITTI's, of both cameras."""
+    write_images(tmp_path, both("{side}/{name}.png", ["0", "1"]))
+    rows = [f"{k} {c} 1 0 0 {-0.5 * c} 0 1 0 0 0 0 1 {-k} 0 0 0 1" for k in range(2) for c in range(2)]
+    write_lines(tmp_path / "extrinsic.txt", ["frame camera r1 r2 r3 t1 r4 r5 r6 t2 r7 r8 r9 t3 0 0 0 1", *rows])
+    found = inspect(tmp_path)
+    assert not found.tables
+    assert any("extrinsic.txt" in line and "no pose" in line for line in found.unread)
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("wheel_odometry.tum", "odometry"), ("odom.csv", "odometry"), ("gt_odom.tum", "truth"), ("poses.tum", "truth")],

@@ -330,6 +330,21 @@ def test_times_since_1970_beside_gps_weeks_stay_as_they_are(tmp_path):
     assert positions_of(read_motion(path), "csv", {}).times == (1.6e9, 1.6e9 + 1)
 
 
+def test_a_tracker_of_positions_alone_writes_zeros_in_the_place_of_a_quaternion(tmp_path):
+    path = tmp_path / "prism.csv"
+    path.write_text("time,x,y,z,qx,qy,qz,qw\n1,2,3,4,0,0,0,0\n2,3,4,5,0,0,0,0\n")
+    assert positions_of(read_motion(path), "auto", {}).positions == ((2, 3, 4), (3, 4, 5))
+
+
+def test_a_first_column_of_dates_is_the_time(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("date;x;y\n2020-09-13T12:26:40.5Z;1;2\n2020-09-13T12:26:41Z;2;2\n")
+    assert positions_of(read_motion(path), "auto", {}).times == (1600000000.5, 1600000001.0)
+    path.write_text("date,x,y\n09/13/2020 12:26:40,1,2\n09/13/2020 12:26:41,2,2\n")
+    with raises("RIL-291", "09/13/2020"):
+        positions_of(read_motion(path), "auto", {})
+
+
 def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_path):
     rows = "1,0,0,0,0.1,0.2,0.3,0.927\n2,0,0,0,0.1,0.2,0.3,0.927\n"
     plain, with_units = (read(tmp_path, f"time,x,y,z,qx,qy,qz,qw\n{units}{rows}") for units in ("", "s,m,m,m,,,,\n"))
