@@ -23,14 +23,8 @@ from rille.datasets.text.names import derived_name, shell_word
 from rille.datasets.text.reading import read_text
 from rille.stages.core.errors import InputError
 
-PAIRS = (
-    ("image_0", "image_1"),
-    ("image_2", "image_3"),
-    ("image_00", "image_01"),
-    ("image_02", "image_03"),
-    ("image_l", "image_r"),
-    ("left", "right"),
-)
+NUMBERS = (("0", "1"), ("2", "3"), ("00", "01"), ("02", "03"), ("l", "r"))
+PAIRS = (*((f"image_{left}", f"image_{right}") for left, right in NUMBERS), ("left", "right"))
 """Names of the image folders, left and right; grey KITTI cameras before colour ones."""
 
 FORMS = (

@@ -59,7 +59,7 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
     (lambda f: f.with_parts({"Camera": "Camera."}).has("Camera.fx", "Camera1.fx"), slam.orbslam),
-    (slam.is_list, slam.camera_list),
+    (lambda f: isinstance(f.values.get("cameras"), list), slam.camera_list),
     (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),

@@ -20,13 +20,8 @@ from rille.stages.geometry.lens import Lens
 BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C", "T_b")
 """Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS, VBR."""
 
-OF_LIST = {
-    "image_dimension": "resolution",
-    "image_width": "width",
-    "image_height": "height",
-    "distortion_parameters": "distortion_coeffs",
-}
-"""Keys of a camera in a list, and the same of a chain."""
+DISTORTION = ("distortion_coeffs", "distortion_coefficients", "distortion_parameters")
+"""Keys of the coefficients of Kalibr, of OKVIS, and of SVO."""
 
 BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
 """Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
@@ -68,28 +63,20 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
         if T is None:
             part.check_turn()
     return [
-        CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)
+        CalibratedCamera(name, _pinhole_lens(part, part.spelt(DISTORTION)), T)
         for name, part, T in zip(names, parts, poses, strict=True)
     ]
-
-
-def is_list(f: Fields) -> bool:
-    """Whether ``cameras`` is a list of cameras with their optics."""
-    listed = f.values.get("cameras")
-    return isinstance(listed, list) and all(
-        isinstance(one, Mapping) and {"camera", "focal_length"} & one.keys() for one in listed
-    )
 
 
 def camera_list(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of OKVIS, or of maplab, ROVIO and SVO, whose optics are a part ``camera`` with a part ``distortion``."""
     parts = dict[str, dict[str, object]]()
     for k, one in enumerate(f.get("cameras")):
+        if not isinstance(one, Mapping) or not {"camera", "focal_length"} & one.keys():
+            return []
         whole = Fields(one, f.file).with_parts({"camera": ""}).with_parts({"distortion": "distortion_"})
-        part = {OF_LIST.get(key, key): value for key, value in whole.values.items()}
-        if "focal_length" in part:
-            part["intrinsics"] = [part.pop("focal_length"), part.pop("principal_point", [])]
-        parts[f"cam{k}"] = part
+        apart = whole.values.pop("focal_length", []), whole.values.pop("principal_point", [])
+        parts[f"cam{k}"] = {"intrinsics": [*apart], **whole.values}
     f.values = {**parts}
     return kalibr(f, path)
 
@@ -211,7 +198,8 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     fx, fy, cx, cy = f.numbers(key, 4)
     if "sensor_type" in f and "resolution" not in f:
         fy, cx = cx, fy  # OpenLORIS lists fx, cx, fy, cy
-    size = f.size("resolution") if "resolution" in f else f.size("width", "height")
+    whole, sides = f.spelt(("resolution", "image_dimension")), (("width", "image_width"), ("height", "image_height"))
+    size = f.size(whole) if whole in f else f.size(*map(f.spelt, sides))
     return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), size))
 
 

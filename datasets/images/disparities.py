@@ -56,22 +56,20 @@ def decode(data: bytes, size: tuple[int, int], name: str, scale: float = 1.0) ->
     return np.where(known, values, np.float32(np.nan))
 
 
-def scales(
-    paths: Mapping[Path, Path], size: tuple[int, int], stated: float | None
-) -> tuple[dict[Path, float], dict[Path, InputError]]:
-    """Values for a pixel, stated or usual, of the maps (by left image, as :func:`find` gives them); and errors of those
-    that :func:`decode` refuses by their headers, or whose scale is unknown."""
-    found, errors = dict[Path, float](), dict[Path, InputError]()
+def scales(paths: Mapping[Path, Path], size: tuple[int, int], stated: float | None) -> dict[Path, float | InputError]:
+    """Values for a pixel, stated or usual, of each map (by left image, as :func:`find` gives them); the error of one
+    that :func:`decode` refuses by its header, or whose scale is unknown."""
+    found = dict[Path, float | InputError]()
     for left, path in paths.items():
         try:
             with _refusal(str(path)), path.open("rb") as file:
-                scale = stated or _unpacker(file, size)[0]
-                if scale is None:
+                usual = _unpacker(file, size)[0]
+                if stated is None and usual is None:
                     raise ValueError("its values are integers: state scale, the values for a pixel (SGBM's are 16)")
-                found[left] = scale
+                found[left] = stated or usual or 1.0
         except InputError as error:
-            errors[left] = error
-    return found, errors
+            found[left] = error
+    return found
 
 
 @contextmanager
@@ -116,9 +114,8 @@ def _image(file: BinaryIO, size: tuple[int, int]) -> tuple[tuple[int, ...], str,
     if image is None:
         raise ValueError("it is of no kind that is read")
     # Pillow's names of one channel.
-    kind = {"F": "floats", "L": "integers", "I;16": "integers", "I;16B": "integers", "I": "integers"}.get(image.mode)
-    if (image.format, image.mode) == ("PNG", "I;16"):
-        kind = "16-bit PNG"
+    kinds = {"F": "floats", "L": "integers", "I;16": "integers", "I;16B": "integers", "I": "integers"}
+    kind = "16-bit PNG" if (image.format, image.mode) == ("PNG", "I;16") else kinds.get(image.mode, image.mode)
 
     def pixels() -> AnyArray:
         values = np.asarray(image, np.float32)  # Pillow handles PFM's order of rows and bytes
@@ -127,7 +124,7 @@ def _image(file: BinaryIO, size: tuple[int, int]) -> tuple[tuple[int, ...], str,
             values = np.where(values == np.float32(image.tag_v2[42113].strip("\0 ")), np.float32(np.nan), values)
         return values
 
-    return image.size, kind or image.mode, pixels
+    return image.size, kind, pixels
 
 
 def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:

@@ -67,9 +67,7 @@ def table_kind(path: Path, pairs: int) -> str:
     if matrix_at(table) is not None or (meant.keys() >= {"x", "y", *QUATERNION} and not table.crs):
         # Of cameras or sensors, as "image_00: ...", or a single one, it says where they are mounted.
         mounts = table.rows[0][0].endswith(":") or (len(table.rows) == 1 < pairs and "time" not in meant)
-        if not mounts:
-            poses_of(table)  # which may refuse it
-        return "" if mounts else poses
+        return poses if not mounts and poses_of(table).poses else ""  # which may refuse it
     # Of degrees that are no decimal ones the error says how to write them.
     placed = meant.keys() >= {"x", "y"} or meant.keys() >= {"lat", "lon"}
     positions = positions_of(table, "csv", {}) if placed else None
@@ -79,8 +77,12 @@ def table_kind(path: Path, pairs: int) -> str:
     images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
     if images and "time" in meant and len(table.rows) == pairs:
         return "times"
-    if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
-        poses_of(table)
+    if (
+        row.size >= 8
+        and row.size not in (12, 16)
+        and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3
+        and poses_of(table).poses
+    ):
         return poses
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
     rising = row.size == 1 and len(table.rows) == pairs and bool((np.diff(table.values([0]), axis=0) > 0).all())

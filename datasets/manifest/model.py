@@ -465,13 +465,10 @@ class Manifest(Table):
     notes: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _one_rotation(self) -> Manifest:
+    def _one_rotation_and_a_whole_place(self) -> Manifest:
         if self.attitude is not None and self.imu is not None:
             raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _crs_alone_is_that_of_positions(self) -> Manifest:
+        # A CRS alone is that of positions.
         if self.world.crs is not None and self.world.missing and self.positions is None:
             raise ValueError("world: a place needs crs, origin and azimuth_deg: origin and azimuth_deg missing")
         return self

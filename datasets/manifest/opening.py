@@ -165,29 +165,27 @@ def _disparity(
     if isinstance(claimed, str):
         maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
-    common = {"size": list(size), "sigma": sigma}
-    of_values, bad = disparities.scales(maps["column_disparity"], size, stated.scale)
-    of_sigma, errors = disparities.scales(maps.get("disparity_std", {}), size, None)
-    bad |= errors
-    turn = -1.0 if stated.sign == "left-right" else 1.0
+    common, turn = {"size": list(size), "sigma": sigma}, -1.0 if stated.sign == "left-right" else 1.0
+    read = {a: disparities.scales(of, size, None if a == "disparity_std" else stated.scale) for a, of in maps.items()}
+    bad = {left: scale for of in read.values() for left, scale in of.items() if isinstance(scale, InputError)}
+    scales = {a: {k: s for k, s in of.items() if not isinstance(s, InputError)} for a, of in read.items()}
     if bad and not set.intersection(*map(set, maps.values())) - bad.keys():
         raise next(iter(bad.values()))
 
     def source(frame: int) -> Source:
         paths = {array: of[pairs[frame].left] for array, of in maps.items()}
-        left = pairs[frame].left
-        of_maps = {"column_disparity": turn * of_values[left]}
-        of_maps |= {"disparity_std": of_sigma[left]} if left in of_sigma else {}
-        known = {array: digests.sha256(path) for array, path in paths.items()}
-        args = {**common, "frame": frame, "digests": known, "scales": of_maps}
+        digest = {array: digests.sha256(path) for array, path in paths.items()}
+        scale = {array: of[pairs[frame].left] for array, of in scales.items()}
+        scale["column_disparity"] *= turn
+        args = {**common, "frame": frame, "digests": digest, "scales": scale}
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
     absent = {left: f"{error.message} ({key})" for left, error in bad.items()}
     lacking = (pair.left for pair in pairs if any(pair.left not in of for of in maps.values()))
     absent |= {left: f"the map of {left.name} ({key}) is missing" for left in lacking}
-    scale = next(iter(of_values.values()))
-    remark = "" if scale == 1.0 else f" ({scale:g} values a pixel)"
+    packed = sorted({*scales["column_disparity"].values()} - {1.0})
+    remark = "".join(f" ({scale:g} values a pixel)" for scale in packed)
     return source, {k: absent[pair.left] for k, pair in enumerate(pairs) if pair.left in absent}, remark
 
 

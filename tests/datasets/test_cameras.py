@@ -982,6 +982,16 @@ right:
 """
 
 
+@pytest.mark.parametrize(
+    ("radial", "kept"), [("[]", (0, 0)), ("[-0.3]", (-0.3, 0)), ("[-0.3, 0.1, 0.02]", (-0.3, 0.1))]
+)
+def test_boofcv_has_up_to_three_radial_terms(tmp_path, radial, kept):
+    left, _ = read_cameras(written(tmp_path, BOOF.replace("[-0.36, 0.17]", radial)))
+    assert left.lens.coefficients == (*kept, 0.001, 0.002, *((0.02,) if "0.02" in radial else ()))
+    with raises("RIL-370", "radial", "6 coefficients"):
+        read_cameras(written(tmp_path, BOOF.replace("[-0.36, 0.17]", "[-0.3, 0.1, 0.02, 0.3]")))
+
+
 def test_boofcv_right_to_left(tmp_path):
     """Its coordinates begin at the corner of the first pixel."""
     left, right = read_cameras(written(tmp_path, BOOF))

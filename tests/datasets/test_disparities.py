@@ -76,7 +76,7 @@ def test_all_kinds_read_alike(data):
 def test_png_has_256_values_a_pixel(tmp_path):
     path = tmp_path / "map.png"
     path.write_bytes(encoded(".png", np.rint(256 * np.abs(MAP)).astype(np.uint16)))
-    [scale] = scales({path: path}, COLUMNS_ROWS, None)[0].values()
+    [scale] = scales({path: path}, COLUMNS_ROWS, None).values()
     np.testing.assert_array_equal(decode(path.read_bytes(), COLUMNS_ROWS, "a map", scale), np.abs(WANTED))
 
 
