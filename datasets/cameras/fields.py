@@ -55,7 +55,7 @@ COEFFICIENT = re.compile(
 
 TURN = re.compile(
     r"(?:left_|right_)?"
-    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|q|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*|stereo_?transform\w*)",
+    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|rpy\w*|q|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*|stereo_?transform\w*)",
     re.I,
 )
 """Keys that say how a camera is turned."""

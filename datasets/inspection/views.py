@@ -223,8 +223,8 @@ def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: P
 
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
-    seen = f" ({ends(images)})" if images else ""
-    text = f"{folder} holds {len(images)} images{seen}, {counts[0]} named as left and {counts[1]} as right: no pairs"
+    seen = f"{len(images)} images ({ends(images)})"
+    text = f"{folder} holds {seen}, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
     by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
     remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"

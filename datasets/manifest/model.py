@@ -240,8 +240,7 @@ class Times(Table):
 
     @model_validator(mode="after")
     def _one_source(self) -> Times:
-        given = [self.file is not None, self.names, self.rate_hz is not None]
-        if sum(given) != 1:
+        if [self.file is not None, self.names, self.rate_hz is not None].count(True) != 1:
             raise ValueError("give one of file, names = true or rate_hz")
         return self
 

@@ -368,12 +368,13 @@ class MotionReader:
 
     def doubt_clock(self, section: model.Recorded, table: TextTable) -> None:
         """Warn of times since 1970 that are called GPS time, and of GPS weeks, unless an offset is stated."""
-        column = meanings(table).get("time", -1)
-        if section.time_offset == 0.0 and column >= 0 and week_of(table, column) is not None:
+        column = meanings(table).get("time")
+        if section.time_offset != 0.0 or column is None:
+            return
+        if week_of(table, column) is not None:
             text = f"{section.file}: its GPS weeks are read as UTC, 18 s less"
             self.warn((warning("RIL-785", f"{text}: if those of the images are GPS time, state time_offset = 18"),))
-        named = column >= 0 and table.header and GPS_TIME.fullmatch(unitless(table.header[column]))
-        if named and section.time_offset == 0.0 and (table.values([column]) > 1e9).all():
+        elif GPS_TIME.fullmatch(unitless(table.header[column])) and (table.values([column]) > 1e9).all():
             text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
             self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
 

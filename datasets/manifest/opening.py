@@ -184,8 +184,7 @@ def _disparity(
     absent = {left: f"{error.message} ({key})" for left, error in bad.items()}
     lacking = (pair.left for pair in pairs if any(pair.left not in of for of in maps.values()))
     absent |= {left: f"the map of {left.name} ({key}) is missing" for left in lacking}
-    packed = sorted({*scales["column_disparity"].values()} - {1.0})
-    remark = "".join(f" ({scale:g} values a pixel)" for scale in packed)
+    remark = "".join(f" ({s:g} values a pixel)" for s in sorted({*scales["column_disparity"].values()} - {1.0}))
     return source, {k: absent[pair.left] for k, pair in enumerate(pairs) if pair.left in absent}, remark
 
 

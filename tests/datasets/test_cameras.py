@@ -735,6 +735,7 @@ T44 = np.block([[ROTATION, SHIFT[:, None]], [np.zeros(3), 1.0]]).tolist()
         (TWO | {"stereo_pose": np.array(T44)[:3].tolist()}, "stereo_pose"),
         (ONE | {"rmat": ROTATION.ravel().tolist(), "baseline": 0.12}, "rmat"),
         (TWO | {"om": [0, 0.1, 0], "T": SHIFT.tolist()}, "om"),
+        (TWO | {"T": SHIFT.tolist(), "rpy": [0.1, 0, 0]}, "rpy"),
         ({"calibration_parameters": ONE | {"stereo_transform": {"rotation": [0, 0.1, 0]}}}, "stereo_transform"),
     ],
 )
