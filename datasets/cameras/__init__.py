@@ -124,8 +124,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
 def _nested(fields: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of nested entries; empty if these are of no known format."""
     for knows, read_fields in NESTED:
-        if knows(fields):
-            found = read_fields(fields, path)
+        if knows(fields) and (found := read_fields(fields, path)):
             fields.check_lens()
             if any(camera.T_camera_reference is None for camera in found):
                 fields.check_turn()

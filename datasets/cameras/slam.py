@@ -69,7 +69,10 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
 
 
 def camera_list(f: Fields, path: Path) -> list[CalibratedCamera]:
-    """Cameras of OKVIS, or of maplab, ROVIO and SVO, whose optics are a part ``camera`` with a part ``distortion``."""
+    """Cameras of OKVIS, or of maplab, ROVIO and SVO, whose optics are a part ``camera`` with a part ``distortion``.
+
+    Empty if the list holds anything else.
+    """
     parts = dict[str, dict[str, object]]()
     for k, one in enumerate(f.get("cameras")):
         if not isinstance(one, Mapping) or not {"camera", "focal_length"} & one.keys():
@@ -77,8 +80,8 @@ def camera_list(f: Fields, path: Path) -> list[CalibratedCamera]:
         whole = Fields(one, f.file).with_parts({"camera": ""}).with_parts({"distortion": "distortion_"})
         apart = whole.values.pop("focal_length", []), whole.values.pop("principal_point", [])
         parts[f"cam{k}"] = {"intrinsics": [*apart], **whole.values}
-    f.values = {**parts}
-    return kalibr(f, path)
+    f.values = f.values | parts
+    return kalibr(f, path) if parts else []
 
 
 def _of_body(part: Fields) -> RigidTransform | None:

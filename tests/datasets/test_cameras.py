@@ -446,6 +446,14 @@ def test_a_list_of_cameras_says_what_a_chain_says(tmp_path, form):
         read_cameras(written(tmp_path, json.dumps({"cameras": cameras})))
 
 
+@pytest.mark.parametrize("listed", [[], ["left", "right"], [{}, {}]])
+def test_a_list_of_other_things_is_none_of_cameras(tmp_path, listed):
+    figures = {"fx": 458, "fy": 457, "cx": 367, "cy": 248, "baseline": 0.11}
+    assert len(read_cameras(written(tmp_path, json.dumps({"cameras": listed} | figures)))) == 2
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, json.dumps({"cameras": listed})))
+
+
 def test_kalibr_of_one_camera(tmp_path):
     """It stands where the IMU says, or nowhere: in a chain of one camera no link is missing."""
     one = "cam0: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512]{}}}\n"
