@@ -371,12 +371,13 @@ class MotionReader:
         column = meanings(table).get("time")
         if section.time_offset != 0.0 or column is None:
             return
-        if week_of(table, column) is not None:
-            text = f"{section.file}: its GPS weeks are read as UTC, 18 s less"
-            self.warn((warning("RIL-785", f"{text}: if those of the images are GPS time, state time_offset = 18"),))
-        elif GPS_TIME.fullmatch(unitless(table.header[column])) and (table.values([column]) > 1e9).all():
-            text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
-            self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
+        named = GPS_TIME.fullmatch(unitless(table.header[column])) and (table.values([column]) > 1e9).all()
+        what, other, offset = "its times are called GPS time, which is 18 s ahead of UTC", "UTC", -18
+        if weeks := week_of(table, column) is not None:
+            what, other, offset = "its GPS weeks are read as UTC, 18 s less", "GPS time", 18
+        if weeks or named:
+            text = f"{section.file}: {what}: if those of the images are {other}, state time_offset = {offset}"
+            self.warn((warning("RIL-785", text),))
 
     def measured(self, section: model.PositionFile) -> None:
         """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.

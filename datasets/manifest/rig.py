@@ -232,7 +232,7 @@ def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: S
     bare = [side for side, camera in zip(("left", "right"), cameras, strict=True) if camera.lens.model == "none"]
     if len(bare) == 1 and not all(camera.lens.ideal for camera in cameras):
         text = f"of the {bare[0]} camera no distortion is stated, of the other one it is: it is taken as free of it"
-        lines.append(warning("RIL-812", f"{text}; state its coefficients, or zeros if that is so"))
+        lines.append(warning("RIL-105", f"{text}; state its coefficients, or zeros if that is so"))
     for side, calibrated, (width, height) in zip(("left", "right"), cameras, sizes, strict=True):
         c = calibrated.lens.camera
         view = math.degrees(2 * math.atan(width / 2 / c.fx))

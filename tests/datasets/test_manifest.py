@@ -221,7 +221,7 @@ def test_a_distortion_of_one_camera_alone_is_said(tmp_path, right, said):
     figures = "fx = 60.0\ncx = 31.5\ncy = 23.5\n"
     cameras = f"[cameras.left]\n{figures}distortion = [0.1, 0, 0, 0]\n[cameras.right]\n{figures}{right}"
     lines = opened(write_sequence(tmp_path, cameras=cameras)).warnings
-    assert ["RIL-812" in line and "right" in line for line in lines] == [True] * said
+    assert ["RIL-105" in line and "right" in line for line in lines] == [True] * said
 
 
 def smaller_right_images(folder: Path) -> Path:
