@@ -31,7 +31,7 @@ from rille.datasets.imu import ImuRecord, Inertial, at_frames, sensed
 from rille.datasets.inspection.calibration import CALIBRATIONS, find_calibration
 from rille.datasets.inspection.views import FoundImages
 from rille.datasets.manifest.model import Cameras, Images, Manifest, RigSection
-from rille.datasets.manifest.rig import CAR, STREET, Optics, check_baseline, placed, read_optics, unusual_cameras
+from rille.datasets.manifest.rig import Optics, check_baseline, placed, read_optics, street_defaults, unusual_cameras
 from rille.datasets.poses import TimedPoses, interpolate
 from rille.datasets.protocol import CAMERAS, Sequence, Source
 from rille.datasets.text.names import derived_name
@@ -135,7 +135,7 @@ def open_bag(
         lenses=optics.lenses,
         times=times,
         odometry=odometry,
-        defaults=STREET if optics.rig.baseline >= CAR else {},
+        defaults=street_defaults(optics.rig),
         warnings=(*warnings, *optics.warnings, *unused),
     )
     sequence = sensed(sequence, inertial)

@@ -99,7 +99,5 @@ def sensors(folder: Path) -> tuple[Truth | None, Imu | None, list[str]]:
 def body_pose(folder: Path) -> RigidTransform | None:
     """``T_BS`` of a sensor: its pose in the body; None if its folder does not state it."""
     path = folder / "sensor.yaml"
-    if not path.is_file():
-        return None
-    fields = Fields.read(path)
+    fields = Fields.read(path) if path.is_file() else Fields({}, str(path))
     return fields.pose("T_BS") if "T_BS" in fields else None

@@ -17,20 +17,14 @@ from rille.datasets.cameras import read_cameras
 from rille.datasets.images.files import SUFFIXES, Digests
 from rille.datasets.manifest.model import Cameras, Images, Manifest, Times, Truth, stated_vehicle
 from rille.datasets.manifest.opening import open_folder
-from rille.datasets.manifest.rig import CAR, STREET
+from rille.datasets.manifest.rig import street_defaults
 from rille.datasets.protocol import Sequence
 from rille.datasets.text.names import derived_name, shell_word
 from rille.datasets.text.reading import read_text
 from rille.stages.core.errors import InputError
 
-PAIRS = (
-    ("image_0", "image_1"),
-    ("image_2", "image_3"),
-    ("image_00", "image_01"),
-    ("image_02", "image_03"),
-    ("image_l", "image_r"),
-    ("left", "right"),
-)
+NUMBERS = (("0", "1"), ("2", "3"), ("00", "01"), ("02", "03"), ("l", "r"))
+PAIRS = (*((f"image_{left}", f"image_{right}") for left, right in NUMBERS), ("left", "right"))
 """Names of the image folders, left and right; grey KITTI cameras before colour ones."""
 
 FORMS = (
@@ -69,7 +63,7 @@ def open_layout(path: Path, number: str | None, digests: Digests) -> Sequence | 
     manifest = manifest_of(folder, sides)
     spare = [folder / "times.txt", *([Path(manifest.truth.file)] if manifest.truth else [])]
     sequence = open_folder(manifest, folder, digests, spare)
-    return replace(sequence, defaults=STREET if sequence.rig.baseline >= CAR else {})
+    return replace(sequence, defaults=street_defaults(sequence.rig))
 
 
 def _of_several(root: Path, number: str | None) -> Path:

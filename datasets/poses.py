@@ -35,7 +35,7 @@ from rille.datasets.text import units
 from rille.datasets.text.columns import ANGLES, POSITION, QUATERNION, UNTIMED, meanings, stated_column
 from rille.datasets.text.reading import GREATEST, read_lines
 from rille.datasets.text.tables import TextTable, read_table
-from rille.datasets.text.times import UNITS, of_two, seconds
+from rille.datasets.text.times import GPS_EPOCH, SECONDS_OF_WEEK, UNITS, of_two, of_week, seconds
 from rille.datasets.text.units import unitless
 from rille.stages.core.arrays import Bools, Floats
 from rille.stages.core.declare import AnyArray
@@ -50,9 +50,6 @@ IMAGE = re.compile(r"\s*(\d+(?:\s+\S+){7}\s+\d+)\s+(\S.*?)\s*")
 
 STAMP = re.compile(r"\d{16,}")
 """Time of EuRoC, nanoseconds; programs that write seconds have other orders of columns."""
-
-GPS_EPOCH = 315964782
-"""s from 1970 to 1980, where GPS time begins, less its 18 leap seconds since."""
 
 WITHIN = 1e-6
 """s; times that differ by less are equal."""
@@ -296,7 +293,17 @@ def times_of(table: TextTable, column: int) -> tuple[float, ...]:
     unit = stated if stated in UNITS else "auto"
     if NANOSECONDS.fullmatch("".join(table.header[column + 1 : column + 2])):
         stamps, unit = list(map(of_two, stamps, table.text(column + 1))), "s"
+    if (week := week_of(table, column)) is not None:
+        # u-blox' iTOW is in milliseconds, which its name does not say.
+        unit = unit if unit != "auto" else "s" if table.values([column]).max() <= SECONDS_OF_WEEK else "ms"
+        stamps, unit = [of_week(*cells, UNITS[unit]) for cells in zip(table.text(week), stamps, strict=True)], "s"
     return seconds(stamps, table.name, unit=unit, lines=table.lines)
+
+
+def week_of(table: TextTable, column: int) -> int | None:
+    """Column of GPS weeks beside a ``column`` of times within them; None: there is none."""
+    week = meanings(table).get("week", column)
+    return week if week != column and table.values([column]).max() <= 1000 * SECONDS_OF_WEEK else None
 
 
 def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, int]:
@@ -307,11 +314,8 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
         if {"x", "y"} <= set(meant):
             lacking = ", ".join(q for q in QUATERNION if q not in meant)
             text = f"{table.name}: its columns {', '.join(table.header)} are positions without a rotation ({lacking})"
-            heading = next((name for name in table.header if HEADING.search(name)), "")
-            hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading}"
-            hint = f"{hint} if it is counter-clockwise from x; else " if heading else ""
             remedy = "add qw, qx, qy, qz or yaw_deg (roll_deg, pitch_deg); positions alone are [positions] or [truth]"
-            raise InputError("RIL-801", text, remedy=hint + remedy)
+            raise InputError("RIL-801", text, remedy=_perhaps_yaw(table) + remedy)
     form = format if format != "auto" else "euroc" if table.commas else "tum"
     frames = by_name.untimed(table)
     bare = table.commas and (frames or table.columns == len(ORDERED["tum"])) and not STAMP.fullmatch(table.rows[0][0])
@@ -327,8 +331,15 @@ def _columns(table: TextTable, format: str, meant: dict[str, int]) -> dict[str, 
         text = f"{table.name}, line {table.lines[0]}: {seen} are no pose{stated}"
         named = "columns with names (csv), as time,qw,qx,qy,qz or time,roll_deg,pitch_deg,yaw_deg"
         remedy = f"3 x 4 numbers (kitti), time and 7 numbers (tum, euroc), or {named}; or state the format"
-        raise InputError("RIL-264", text, remedy=remedy)
+        raise InputError("RIL-264", text, remedy=_perhaps_yaw(table) + remedy)
     return {name: k for k, name in enumerate(order)}
+
+
+def _perhaps_yaw(table: TextTable) -> str:
+    """Beginning of a remedy for a table with a heading, of which nothing says how it counts; empty without one."""
+    heading = next((name for name in table.header if HEADING.search(name)), "")
+    hint = f"write a column yaw_deg: 90 less {heading} if that is degrees clockwise from y (north), {heading}"
+    return f"{hint} if it is counter-clockwise from x; else " if heading else ""
 
 
 def _angles(table: TextTable, columns: Mapping[str, int]) -> Floats:

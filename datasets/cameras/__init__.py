@@ -24,11 +24,12 @@ from rille.stages.geometry.geometry import RigidTransform
 __all__ = ["UNKNOWN_SIZE", "CalibratedCamera", "read_cameras", "rig_of"]
 
 KNOWN = (
-    "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr, EuRoC sensor.yaml, ORB-SLAM, "
-    "camodocal, VINS, Basalt, mrcal, DSO, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, RealSense (rs-enumerate-devices -c), "
-    "COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels and .cahvor (CAHV, CAHVOR, CAHVORE) "
-    "are read; of another program write fx, fy, cx, cy and baseline (m), or K1, D1, K2, D2, R and T (metres; MATLAB's "
-    "K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / tan(horizontal angle of view / 2)"
+    "OpenCV (YAML, XML; Metashape exports it, too), ROS camera_info and ost.txt, Kalibr's camchain, EuRoC sensor.yaml, "
+    "OKVIS, SVO, ORB-SLAM, stella_vslam, camodocal, VINS, Basalt, mrcal, DSO, MRPT, DSEC, BoofCV, ZED .conf, DepthAI, "
+    "RealSense (rs-enumerate-devices -c), COLMAP, Middlebury calib.txt, KITTI, K.txt, ASP .tsai, PDS3 or VICAR labels "
+    "and .cahvor (CAHV, CAHVOR, CAHVORE) are read; of another program write fx, fy, cx, cy and baseline (m), or K1, "
+    "D1, K2, D2, R and T (metres; MATLAB's K and R transposed), as OpenCV's YAML; of a simulator fx = fy = width / 2 / "
+    "tan(horizontal angle of view / 2)"
 )
 
 Text: TypeAlias = Callable[[str], bool]
@@ -57,7 +58,8 @@ PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = 
 
 NESTED: tuple[tuple[Callable[[Fields], bool], Callable[[Fields, Path], list[CalibratedCamera]]], ...] = (
     (lambda f: bool(opencv.sides(f)), opencv.stereo),
-    (lambda f: f.has("Camera.fx", "Camera1.fx"), slam.orbslam),
+    (lambda f: f.with_parts({"Camera": "Camera."}).has("Camera.fx", "Camera1.fx"), slam.orbslam),
+    (lambda f: isinstance(f.values.get("cameras"), list), slam.camera_list),
     (lambda f: bool(slam.chain(f)), slam.kalibr),
     (lambda f: "intrinsics" in f and f.has("T_BS", "distortion_coefficients"), slam.sensor),
     (lambda f: "model_type" in f, slam.camodocal),
@@ -122,8 +124,7 @@ def _read(text: str, path: Path) -> list[CalibratedCamera]:
 def _nested(fields: Fields, path: Path) -> list[CalibratedCamera]:
     """Cameras of nested entries; empty if these are of no known format."""
     for knows, read_fields in NESTED:
-        if knows(fields):
-            found = read_fields(fields, path)
+        if knows(fields) and (found := read_fields(fields, path)):
             fields.check_lens()
             if any(camera.T_camera_reference is None for camera in found):
                 fields.check_turn()

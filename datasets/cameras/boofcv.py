@@ -38,9 +38,5 @@ def _lens(f: Fields) -> Lens:
         return Lens(camera)
     bent = f.sub("radial_tangential")
     radial = bent.numbers("radial") if "radial" in bent else ()
-    if len(radial) > 3:
-        text = f"has {len(radial)} numbers, at most 3 are read"
-        raise bent.error("RIL-105", "radial", text, "calibrate with fewer")
-    k1, k2, k3 = (*radial, 0.0, 0.0, 0.0)[:3]
-    coefficients = (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), k3)
-    return bent.lens("radial", camera, "radtan", coefficients if k3 else coefficients[:4])
+    k1, k2, *more = (*radial, *(0.0, 0.0)[len(radial) :])
+    return bent.lens("radial", camera, "radtan", (k1, k2, bent.number("t1", 0.0), bent.number("t2", 0.0), *more))

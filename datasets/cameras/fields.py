@@ -28,7 +28,7 @@ MODELS: Mapping[str, str] = {
         "": "pinhole perspective rectified",
         "none": "none nodistortion",
         "radtan": "radtan radialtangential plumbbob brown brownconrady opencv",
-        "rational": "rational rationalpolynomial fullopencv",
+        "rational": "rational rationalpolynomial fullopencv radialtangential8 radtan8",
         "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8",
         "realsense": "inversebrownconrady modifiedbrownconrady ftheta",
         "unread": "omni omnidirectional mei ucm eucm ds doublesphere fov atan scaramuzza fisheye62 fisheye624",
@@ -55,7 +55,7 @@ COEFFICIENT = re.compile(
 
 TURN = re.compile(
     r"(?:left_|right_)?"
-    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|q|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*)",
+    r"(R|om|r_?vec|rot(ation)?_?\w*|euler\w*|rpy\w*|q|quat(ernion)?|extrinsics?|(?-i:[RT]_\w+)|toe_?in\w*|stereo_?transform\w*)",
     re.I,
 )
 """Keys that say how a camera is turned."""
@@ -242,6 +242,8 @@ class Fields:
         # ROS writes five zeros for cameras without distortion, whatever the model.
         if stated == "fisheye" or (stated and any(coefficients)):
             model = stated
+        if stated == "none" and not coefficients:
+            model, coefficients = "radtan", (0.0,) * 4  # it is said to have none
         if model == "fisheye" and not any(coefficients[4:]):
             coefficients = coefficients[:4]  # RealSense lists five
         return self.lens(key, camera, model, coefficients)

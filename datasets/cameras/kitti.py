@@ -16,6 +16,7 @@ import numpy as np
 from rille.datasets.cameras.fields import Fields
 from rille.datasets.cameras.model import CalibratedCamera
 from rille.datasets.cameras.text import entries
+from rille.datasets.text.tables import number
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, within
 from rille.stages.geometry.geometry import RigidTransform, orthonormal
@@ -40,10 +41,7 @@ def _nameless(text: str) -> dict[str, list[str]]:
     rows = [line.split() for line in text[:100_000].splitlines() if line.strip()]
     if not 2 <= len(rows) <= 4 or any(len(row) != 12 for row in rows):
         return {}
-    try:
-        first = np.array([[float(number) for number in row[:3]] for row in rows])
-    except ValueError:
-        return {}
+    first = np.array([[number(word) for word in row[:3]] for row in rows])
     if not (np.isfinite(first).all() and (np.abs(first).max(axis=1) > LEAST_FOCAL).all()):
         return {}
     return {f"P{k}": row for k, row in enumerate(rows)}
@@ -66,8 +64,8 @@ def _rectified(fields: Fields, label: str) -> CalibratedCamera:
     projection = fields.matrix(label, 3, 4)
     with within(fields.file):
         k, T_camera_reference = decompose(projection, label)
-    number = label.rpartition("_")[2] if label.startswith("P_rect") else ""
-    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.size(f"S_rect_{number}"))
+    rectified = label.rpartition("_")[2] if label.startswith("P_rect") else ""
+    camera = fields.camera(label, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), fields.size(f"S_rect_{rectified}"))
     return CalibratedCamera(label, Lens(camera, "none", ()), T_camera_reference)
 
 

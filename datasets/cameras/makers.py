@@ -20,6 +20,7 @@ from rille.datasets.cameras.opencv import relative
 from rille.datasets.cameras.text import assignments, entries
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.sides import two_sides
+from rille.datasets.text.tables import number
 from rille.datasets.text.units import LENGTHS, unit_of, unitless
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.geometry.lens import Lens
@@ -153,24 +154,21 @@ def realsense(text: str, path: Path) -> list[CalibratedCamera]:
     cameras = {}
     placed = RELATIVE.search(text)
     R, T = (part.split() for part in placed.groups()[1:]) if placed else (None, None)
-    for name, number, body in LISTED.findall(text):
+    for name, camera_number, body in LISTED.findall(text):
         rows = ((key.lower(), value.split()) for key, value in re.findall(r"(\w+)[^:\n]*:(.*)", body))
         stated = {key: row if key == "coeffs" else " ".join(row) for key, row in rows}
         f = Fields({**stated, "R": R, "T": T}, str(path), f"{name} ")
         camera = f.optics("fx fy ppx ppy", f.size("width", "height"), "none").camera
-        pose = RigidTransform.identity() if number == "1" else f.transform("R", "T")
+        pose = RigidTransform.identity() if camera_number == "1" else f.transform("R", "T")
         lens = f.distorted("coeffs", camera)
-        cameras[number, camera.width, camera.height] = CalibratedCamera(name, lens, pose)
+        cameras[camera_number, camera.width, camera.height] = CalibratedCamera(name, lens, pose)
     return list(cameras.values())
 
 
 def numbers_of_matrix(text: str) -> list[str]:
     """The nine numbers fx 0 cx, 0 fy cy, 0 0 1 of a text, and perhaps a tenth; empty for any other text."""
     words = re.sub(r"[\[\],;]", " ", text[:1000]).split()
-    try:
-        k = [float(word) for word in words[:9]]
-    except ValueError:
-        return []
+    k = list(map(number, words[:9]))
     fits = len(words) in (9, 10) and k[0] > LEAST_FOCAL and k[1] == k[3] == k[6] == k[7] == 0 and k[8] == 1
     return words if fits else []
 

@@ -1,4 +1,5 @@
-"""Calibrations of programs of robotics: Kalibr, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt, mrcal, DSO."""
+"""Calibrations of programs of robotics: Kalibr, OKVIS, SVO, EuRoC's sensor.yaml, ORB-SLAM, camodocal, VINS, Basalt,
+mrcal, DSO."""
 
 from __future__ import annotations
 
@@ -18,6 +19,9 @@ from rille.stages.geometry.lens import Lens
 
 BODY_CAMERA = ("T_imu_cam", "T_BS", "T_SC", "T_BC", "T_B_C", "T_b")
 """Keys of the pose of a camera in the frame of the body or of another sensor: of OpenVINS, EuRoC, OKVIS, VBR."""
+
+DISTORTION = ("distortion_coeffs", "distortion_coefficients", "distortion_parameters")
+"""Keys of the coefficients of Kalibr, of OKVIS, and of SVO."""
 
 BASALT: Mapping[str, str] = {"pinhole": "none", "kb4": "fisheye", "pinhole-radtan8": "rational"}
 """Types of cameras of Basalt: model of :mod:`rille.stages.geometry.lens`."""
@@ -59,9 +63,25 @@ def kalibr(f: Fields, path: Path) -> list[CalibratedCamera]:
         if T is None:
             part.check_turn()
     return [
-        CalibratedCamera(name, _pinhole_lens(part, part.spelt(("distortion_coeffs", "distortion_coefficients"))), T)
+        CalibratedCamera(name, _pinhole_lens(part, part.spelt(DISTORTION)), T)
         for name, part, T in zip(names, parts, poses, strict=True)
     ]
+
+
+def camera_list(f: Fields, path: Path) -> list[CalibratedCamera]:
+    """Cameras of OKVIS, or of maplab, ROVIO and SVO, whose optics are a part ``camera`` with a part ``distortion``.
+
+    Empty if the list holds anything else.
+    """
+    parts = dict[str, dict[str, object]]()
+    for k, one in enumerate(f.get("cameras")):
+        if not isinstance(one, Mapping) or not {"camera", "focal_length"} & one.keys():
+            return []
+        whole = Fields(one, f.file).with_parts({"camera": ""}).with_parts({"distortion": "distortion_"})
+        apart = whole.values.pop("focal_length", []), whole.values.pop("principal_point", [])
+        parts[f"cam{k}"] = {"intrinsics": [*apart], **whole.values}
+    f.values = f.values | parts
+    return kalibr(f, path) if parts else []
 
 
 def _of_body(part: Fields) -> RigidTransform | None:
@@ -181,23 +201,26 @@ def _pinhole_lens(f: Fields, distortion: str) -> Lens:
     fx, fy, cx, cy = f.numbers(key, 4)
     if "sensor_type" in f and "resolution" not in f:
         fy, cx = cx, fy  # OpenLORIS lists fx, cx, fy, cy
-    size = f.size("resolution") if "resolution" in f else f.size("width", "height")
+    whole, sides = f.spelt(("resolution", "image_dimension")), (("width", "image_width"), ("height", "image_height"))
+    size = f.size(whole) if whole in f else f.size(*map(f.spelt, sides))
     return f.distorted(distortion, f.camera(key, (fx, fy, cx, cy), size))
 
 
 def orbslam(f: Fields, path: Path) -> list[CalibratedCamera]:
     """Camera or cameras of ORB-SLAM's settings.
 
-    Version 2: equal parallel cameras, ``Camera.bf`` = baseline times fx; its sign is ignored. Version 3:
-    ``Camera1``, ``Camera2`` and ``Stereo.T_c1_c2``, or ``Stereo.b`` of rectified images. Lengths are metres.
+    Version 2, and stella_vslam: equal parallel cameras, ``Camera.bf`` = baseline times fx; its sign is ignored. Version
+    3: ``Camera1``, ``Camera2`` and ``Stereo.T_c1_c2``, or ``Stereo.b`` of rectified images. Lengths are metres.
     """
+    f = f.with_parts({"Camera": "Camera."})
     first = "Camera1" if "Camera1.fx" in f else "Camera"
-    size = f.size("Camera.width", "Camera.height")
+    size = f.size(*(("Camera.cols", "Camera.rows") if "Camera.cols" in f else ("Camera.width", "Camera.height")))
     left = f.optics("fx fy cx cy", size, prefix=f"{first}.")
     if "Stereo.T_c1_c2" in f:
         right = f.optics("fx fy cx cy", size, prefix="Camera2." if "Camera2.fx" in f else f"{first}.")
         return stereo_cameras(left, right, f.pose("Stereo.T_c1_c2").inverse())
-    if "Stereo.b" in f or "Camera.bf" in f:
-        baseline = f.number("Stereo.b") if "Stereo.b" in f else f.number("Camera.bf") / left.camera.fx
+    product = f.spelt(("Camera.bf", "Camera.focal_x_baseline"))
+    if "Stereo.b" in f or product in f:
+        baseline = f.number("Stereo.b") if "Stereo.b" in f else f.number(product) / left.camera.fx
         return stereo_cameras(left, left, parallel(abs(baseline)))
     return [CalibratedCamera(path.stem, left)]

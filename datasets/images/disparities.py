@@ -1,6 +1,6 @@
 """Stage ``disparity``: disparities of a left image by another program; and the assignment of its files to pairs.
 
-Files are PFM, TIFF and npy of floating point, pixels, or PNG of 16 bits as KITTI has them.
+Files are PFM, TIFF and npy of floating point, pixels, PNG of 16 bits as KITTI has them, or integers of a stated scale.
 """
 
 from __future__ import annotations
@@ -27,39 +27,49 @@ from rille.stages.core.declare import AnyArray, Array, Bundle, NoParams, stage
 from rille.stages.core.errors import InputError, within
 from rille.stages.core.quantities import count
 
-Sign = Literal["left-right", "right-left"]
+KINDS = "PFM, TIFF or npy of floating point (pixels), 16-bit PNG (256 a pixel), or integers of a stated scale"
 
-KINDS = "PFM, TIFF or npy of floating point (pixels), or 16-bit PNG (256 a pixel, 0 unknown)"
+USUAL_SCALES: Mapping[str, float | None] = {"floats": 1.0, "16-bit PNG": 256.0, "integers": None}
+"""Values for a pixel, by the kind of a file: PNG of KITTI, DrivingStereo, Argoverse; Cityscapes' are one value more."""
 
 
-def decode(data: bytes, size: tuple[int, int], name: str) -> Floats32:
-    """Values of an encoded map (row, col), from the top; NaN where they are not finite, 0, or marked as no data.
+def decode(data: bytes, size: tuple[int, int], name: str, scale: float = 1.0) -> Floats32:
+    """Pixels of an encoded map (row, col), from the top; NaN where they are not finite, 0, or marked as no data.
 
     Parameters
     ----------
     size : required width and height, compared before anything is unpacked.
     name : for errors.
+    scale : values for a pixel, negative where their sign is the other one.
 
     Raises
     ------
     InputError
-        The file is damaged, of another kind or size, or its values are of another type.
+        The file is damaged, of another kind or size, or most of its values are larger than the images are wide.
     """
     with _refusal(name):
-        values = _unpacker(BytesIO(data), size)().astype(np.float32)
-    return np.where(np.isfinite(values) & (values != 0), values, np.float32(np.nan))
+        values = (_unpacker(BytesIO(data), size)[1]() / np.float32(scale)).astype(np.float32)
+        known = np.isfinite(values) & (values != 0)
+        usual = float(np.median(np.abs(values[known]))) if known.any() else 0.0
+        if usual > size[0]:
+            raise ValueError(f"its values are {usual:g} px, wider than the image: depths, or of another scale")
+    return np.where(known, values, np.float32(np.nan))
 
 
-def refused(paths: Mapping[Path, Path], size: tuple[int, int]) -> dict[Path, InputError]:
-    """Errors of the maps (by left image, as :func:`find` gives them) that :func:`decode` refuses by their headers."""
-    errors = dict[Path, InputError]()
+def scales(paths: Mapping[Path, Path], size: tuple[int, int], stated: float | None) -> dict[Path, float | InputError]:
+    """Values for a pixel, stated or usual, of each map (by left image, as :func:`find` gives them); the error of one
+    that :func:`decode` refuses by its header, or whose scale is unknown."""
+    found = dict[Path, float | InputError]()
     for left, path in paths.items():
         try:
             with _refusal(str(path)), path.open("rb") as file:
-                _unpacker(file, size)
+                usual = _unpacker(file, size)[0]
+                if stated is None and usual is None:
+                    raise ValueError("its values are integers: state scale, the values for a pixel (SGBM's are 16)")
+                found[left] = stated or usual or 1.0
         except InputError as error:
-            errors[left] = error
-    return errors
+            found[left] = error
+    return found
 
 
 @contextmanager
@@ -73,50 +83,48 @@ def _refusal(name: str) -> Iterator[None]:
         raise InputError("RIL-900", text, remedy=f"give a map of the whole left image as {KINDS}") from error
 
 
-def _unpacker(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """Check the header of a map of this width and height; return the function that unpacks its values."""
+def _unpacker(file: BinaryIO, size: tuple[int, int]) -> tuple[float | None, Callable[[], AnyArray]]:
+    """Check the header of a map of this width and height; return its usual scale, and the function that unpacks it."""
     magic = file.read(6)
     file.seek(0)
     # First bytes of NumPy's files.
-    return _numpy(file, size) if magic == b"\x93NUMPY" else _image(file, size)
-
-
-def _check(size: tuple[int, ...], wanted: tuple[int, int], floating: bool) -> None:
-    """Refuse, by a ``ValueError``, a map of another size, or of integers, whose unit is unknown."""
-    if size != wanted:
-        words = [" x ".join(map(str, sides)) for sides in (size, wanted)]
+    found, kind, unpack = (_numpy if magic == b"\x93NUMPY" else _image)(file, size)
+    if found != size:
+        words = [" x ".join(map(str, sides)) for sides in (found, size)]
         raise ValueError(f"it has {words[0]} values, the left image {words[1]} pixels")
-    if not floating:
-        raise ValueError("its values are of a type whose unit is not known")
+    if kind not in USUAL_SCALES:
+        raise ValueError(f"its values are of a type ({kind}) that is not read")
+    return USUAL_SCALES[kind], unpack
 
 
-def _numpy(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """Unpacker of NumPy's array, without execution of any content, and without more memory than the file has."""
+def _numpy(file: BinaryIO, size: tuple[int, int]) -> tuple[tuple[int, ...], str, Callable[[], AnyArray]]:
+    """Size, kind and unpacker of NumPy's array, without execution of any content, and without more memory than the file
+    has."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, by_columns, dtype = read_header[np.lib.format.read_magic(file)](file)
     shape = tuple(side for side in shape if side != 1)  # networks have one channel, and one image a batch
-    _check(shape[::-1], size, dtype.kind == "f")
+    kind = {"f": "floats", "i": "integers", "u": "integers"}.get(dtype.kind, str(dtype))
     order: Literal["F", "C"] = "F" if by_columns else "C"
-    return lambda: np.frombuffer(file.read(), dtype, size[0] * size[1]).reshape(shape, order=order)
+    return shape[::-1], kind, lambda: np.frombuffer(file.read(), dtype, size[0] * size[1]).reshape(shape, order=order)
 
 
-def _image(file: BinaryIO, size: tuple[int, int]) -> Callable[[], AnyArray]:
-    """Unpacker of an image of disparities."""
+def _image(file: BinaryIO, size: tuple[int, int]) -> tuple[tuple[int, ...], str, Callable[[], AnyArray]]:
+    """Size, kind and unpacker of an image of disparities."""
     image = opened(file)
     if image is None:
         raise ValueError("it is of no kind that is read")
-    coded = image.format == "PNG" and image.mode == "I;16"
-    _check(image.size, size, coded or image.mode == "F")
+    # Pillow's names of one channel.
+    kinds = {"F": "floats", "L": "integers", "I;16": "integers", "I;16B": "integers", "I": "integers"}
+    kind = "16-bit PNG" if (image.format, image.mode) == ("PNG", "I;16") else kinds.get(image.mode, image.mode)
 
     def pixels() -> AnyArray:
-        # 256: values of a 16-bit PNG for one pixel. Pillow handles PFM's order of rows and bytes.
-        values = np.asarray(image, np.float32) / (256 if coded else 1)
+        values = np.asarray(image, np.float32)  # Pillow handles PFM's order of rows and bytes
         # GDAL's tag of TIFF: value of the pixels without data.
         if image.format == "TIFF" and 42113 in image.tag_v2:
-            values[values == np.float32(image.tag_v2[42113].strip("\0 "))] = np.nan
+            values = np.where(values == np.float32(image.tag_v2[42113].strip("\0 ")), np.float32(np.nan), values)
         return values
 
-    return pixels
+    return image.size, kind, pixels
 
 
 def find(pattern: str, root: Path, lefts: Sequence[Path], key: str) -> dict[Path, Path]:
@@ -173,7 +181,7 @@ def disparity_stage(
     *,
     frame: int,
     size: tuple[int, int],
-    sign: Sign,
+    scales: Mapping[str, float],
     sigma: float | None,
     digests: Mapping[str, str],
     paths: Mapping[str, str],
@@ -186,13 +194,11 @@ def disparity_stage(
         data = files.read_unchanged(path, digest, f"frame {frame}, map {path}")
         try:
             # Without its folder, which is not in the task's key.
-            arrays[array] = decode(data, wanted, path.name)
+            arrays[array] = decode(data, wanted, path.name, scales[array])
         except InputError as error:
             meta["damage"] = error.message
     if "damage" in meta:
         arrays = {array: np.full(wanted[::-1], np.nan, np.float32) for array in digests}
-    if sign == "left-right":
-        arrays["column_disparity"] *= -1
     if sigma is not None:
         arrays["disparity_std"] = np.full_like(arrays["column_disparity"], sigma)
     return Bundle(arrays, meta)

@@ -28,8 +28,8 @@ CALIBRATIONS = (
 class FoundCalibration:
     """Suitable calibration files: one for both cameras or one each, relative to the folder.
 
-    ``names``: of the two cameras, if the file has more. ``mount``: T_reference_left, if the reference frame of the
-    files is not the left camera's, but mostly that of the body or of the IMU.
+    ``names``: of the two cameras, if the file has more, which are ``among``. ``mount``: T_reference_left, if the
+    reference frame of the files is not the left camera's, but mostly that of the body or of the IMU.
     """
 
     files: tuple[str, ...]
@@ -37,6 +37,7 @@ class FoundCalibration:
     baseline: float | None
     cameras: int
     names: tuple[str, str] | None = None
+    among: tuple[str, ...] = ()
     mount: RigidTransform | None = None
 
     def suits(self, sizes: Sizes | None) -> bool:
@@ -67,15 +68,15 @@ def find_calibration(folder: Path, texts: list[Path], views: FoundImages) -> Cal
                 unread.append(" ".join(str(error).split()))
             continue
         if cameras:
-            read[relative(path, folder)] = of_size(cameras, views.sizes)
+            read[relative(path, folder)] = cameras
     # Of equally good files one of two cameras rather than one of more.
     in_turn = sorted(read.items(), key=lambda item: len(item[1]) > 2)
-    candidates = [_calibration((name,), cameras, views.sides) for name, cameras in in_turn]
+    candidates = [_calibration((name,), cameras, views) for name, cameras in in_turn]
     single = {name: cameras[0] for name, cameras in read.items() if len(cameras) == 1}
     # Cameras of other names differ by the same words as their images.
     renamed = {name: _of_other_side(name, views.sides) for name in single}
     pairs = two_sides(single) or [pair for pair in renamed.items() if pair[0] != pair[1] in single]
-    candidates += [_calibration(pair, [single[name] for name in pair], views.sides) for pair in pairs]
+    candidates += [_calibration(pair, [single[name] for name in pair], views) for pair in pairs]
     if not candidates:
         return Calibrations(None, [], unread)
     place = Path(views.left).parent
@@ -101,14 +102,17 @@ def _of_other_side(name: str, sides: tuple[str, str]) -> str:
     return "".join(words.get(word, word) for word in re.split(r"([^\W_]+)", name))
 
 
-def _calibration(files: tuple[str, ...], cameras: list[CalibratedCamera], sides: tuple[str, str]) -> FoundCalibration:
-    """Of several cameras the two with the numbers in the images' names (``image_2``: ``P2``), else the first two."""
-    numbers = [re.search(r"\d+$", side) for side in sides]
+def _calibration(files: tuple[str, ...], read: list[CalibratedCamera], views: FoundImages) -> FoundCalibration:
+    """Of several cameras the two of the images' sizes, or with the numbers in their names (``image_2``: ``P2``), else
+    the first two."""
+    cameras = of_size(read, views.sizes)
+    numbers = [re.search(r"\d+$", side) for side in views.sides]
     by_number = {int(n[0]): c for c in cameras if (n := re.search(r"\d+(?=\D*$)", c.name))}
     chosen = [by_number[int(n[0])] for n in numbers if n and int(n[0]) in by_number]
     both = chosen if len(cameras) > 2 and len(chosen) == 2 else cameras[:2]
     left, right = both[0], both[-1]
     pose = relative_pose(left, right) if both[1:] else None
     baseline = None if pose is None else float(np.linalg.norm(pose.translation))
-    names = (left.name, right.name) if len(cameras) > 2 else None
-    return FoundCalibration(files, (left.size, right.size), baseline, len(both), names, left.mount)
+    names = (left.name, right.name) if len(read) > 2 else None
+    among = tuple(camera.name for camera in read) if names else ()
+    return FoundCalibration(files, (left.size, right.size), baseline, len(both), names, among, left.mount)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rille.datasets.images.files import SUFFIXES
 from rille.datasets.imu import names_sensors
-from rille.datasets.poses import of_images, of_poses, positions_of
+from rille.datasets.poses import of_images, of_poses, poses_of, positions_of
 from rille.datasets.text.columns import QUATERNION, matrix_at, meanings, of_photographs, untimed
 from rille.datasets.text.tables import ROWS, read_table
 from rille.stages.core.errors import InputError
@@ -20,7 +20,7 @@ ODOMETRY, TRUTH = re.compile("odom|wheel|encoder", re.I), re.compile("truth|(?<!
 
 
 CAMERA_WORDS = re.compile(
-    r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl](_[xy])?\b", re.I
+    r"calib|intrinsic|focal|baseline|distortion|fov|camera_?matrix|lensmodel|\bf[xyl]([lr]|_[xy])?\b", re.I
 )
 """In the name or the text of a file that seems to describe cameras."""
 
@@ -31,8 +31,8 @@ def table_kind(path: Path, pairs: int) -> str:
     Raises
     ------
     InputError
-        It is no text, has decimal commas, holds motions, no poses, or is one of true positions by its columns' names,
-        but cannot be read.
+        It is no text, has decimal commas, holds motions, no poses, or is one of true poses or positions, but cannot be
+        read.
     """
     # Refuses files that are no text; most others are no tables, which is no error.
     if of_images(path):
@@ -67,7 +67,7 @@ def table_kind(path: Path, pairs: int) -> str:
     if matrix_at(table) is not None or (meant.keys() >= {"x", "y", *QUATERNION} and not table.crs):
         # Of cameras or sensors, as "image_00: ...", or a single one, it says where they are mounted.
         mounts = table.rows[0][0].endswith(":") or (len(table.rows) == 1 < pairs and "time" not in meant)
-        return "" if mounts else poses
+        return poses if not mounts and poses_of(table).poses else ""  # which may refuse it
     # Of degrees that are no decimal ones the error says how to write them.
     placed = meant.keys() >= {"x", "y"} or meant.keys() >= {"lat", "lon"}
     positions = positions_of(table, "csv", {}) if placed else None
@@ -77,7 +77,12 @@ def table_kind(path: Path, pairs: int) -> str:
     images = any(cell.lower().endswith(SUFFIXES) for cell in table.rows[0])
     if images and "time" in meant and len(table.rows) == pairs:
         return "times"
-    if row.size >= 8 and row.size not in (12, 16) and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3:
+    if (
+        row.size >= 8
+        and row.size not in (12, 16)
+        and abs(np.linalg.norm(row[4:8]) - 1) < 1e-3
+        and poses_of(table).poses
+    ):
         return poses
     # Beside times of exposure or numbers of frames, as in times.txt of DSO.
     rising = row.size == 1 and len(table.rows) == pairs and bool((np.diff(table.values([0]), axis=0) > 0).all())

@@ -17,7 +17,7 @@ from rille.datasets.images.files import common_header
 from rille.datasets.images.headers import sizes_of
 from rille.datasets.images.kinds import split
 from rille.datasets.images.pairing import ImagePair
-from rille.datasets.text.names import shell_word
+from rille.datasets.text.names import ends, shell_word
 from rille.datasets.text.order import natural, times_in_names
 from rille.datasets.text.sides import CAMERA_NUMBER, SIDES, by_one_word, of_one_camera, side_of
 from rille.stages.core.errors import InputError
@@ -82,11 +82,21 @@ def _by_token(images: list[Path], names: list[str]) -> Sets:
     for (row, place), found in _of_one_kind(named):
         of_side = [{neutral: None for neutral, side, _ in found if side == wanted} for wanted in (0, 1)]
         neutrals = [neutral for neutral in of_side[0] if neutral in of_side[1]]
-        # Two sets in one folder: day1_left_07 and day2_left_07.
+        # Two sets in one folder: day1_left_07 and day2_left_07; loc_cam0_17 and pan_cam0_18.
         words = {neutrals[i]: word for word, of in by_one_word(neutrals).items() for i in of}
+        kinds = [] if words else [_beginning(neutral) for neutral in neutrals]
+        apart = len(set(kinds)) in (2, 3) and all(
+            kinds.count(k) > 1 and re.search(r"[^\W\d_]{2}", k) for k in set(kinds)
+        )
         for neutral, side, path in found:
-            groups[row, f"{place} {words.get(neutral, '')}"][side].append(path)
+            word = _beginning(neutral) if apart else words.get(neutral, "")
+            groups[row, f"{place} {word}"][side].append(path)
     return groups
+
+
+def _beginning(name: str) -> str:
+    """A name of a file, of which nothing is known but that it counts, up to its first number."""
+    return re.split(r"\d", name.rpartition("/")[2])[0]
 
 
 def _of_both_sides(groups: Sets) -> Sets:
@@ -136,7 +146,7 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
     lines, tokens = list[str](), SIDES
     photographs = [path for path in images if not COMPUTED.search(relative(path, folder))]
     both, parts, counts = _sets(folder, photographs)
-    if not both and not parts:
+    if not photographs:
         photographs = images
         both, parts, counts = _sets(folder, images)
     if parts:
@@ -187,15 +197,19 @@ def find_views(folder: Path, images: list[Path]) -> FoundImages:
 
 
 def _by_place(folder: Path, parts: dict[str, list[Path]]) -> Sets:
-    """Images by camera, a set for each folder without the words of cameras, unless each has one frame, or one side."""
-    places: Sets = defaultdict(lambda: ([], []))
-    for side, images in enumerate(parts.values()):
-        for path in images:
-            words = re.split(r"([^\W_]+)", relative(path.parent, folder))
-            places[0, "".join("*" if word in parts else word for word in words)][side].append(path)
+    """Images by camera, a set for each folder without the words of cameras, and for each beginning of names in it,
+    unless each has one frame, or one side."""
+    for whole in (True, False):
+        places: Sets = defaultdict(lambda: ([], []))
+        for side, images in enumerate(parts.values()):
+            for path in images:
+                words = re.split(r"([^\W_]+)", relative(path.parent, folder))
+                kind = _beginning(path.stem) if whole else ""  # loc_0_17 and pan_0_18
+                places[0, "".join("*" if word in parts else word for word in words) + kind][side].append(path)
+        if all(map(all, places.values())) and any(min(map(len, of)) > 1 for of in places.values()):
+            return places
     left, right = parts.values()
-    apart = all(map(all, places.values())) and any(min(map(len, of)) > 1 for of in places.values())
-    return places if apart else {(0, ""): (left, right)}
+    return {(0, ""): (left, right)}
 
 
 def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: Path) -> str:
@@ -209,7 +223,8 @@ def _of_another_set(sides: tuple[list[Path], list[Path]], taken: Path, folder: P
 
 def _no_pairs(folder: Path, images: list[Path], counts: list[int]) -> InputError:
     """Refusal of a folder without pairs; ``counts``: images that are named as left, and as right."""
-    text = f"{folder} holds {len(images)} images, {counts[0]} named as left and {counts[1]} as right: no pairs"
+    seen = f"{len(images)} images ({ends(images)})"
+    text = f"{folder} holds {seen}, {counts[0]} named as left and {counts[1]} as right: no pairs"
     called = "its files or folders named left and right (or _l and _r, cam0 and cam1)"
     by_name = f"give the folder of both cameras, {called}, or write a manifest by hand"
     remedy = by_name if images else "name the folder that holds the images, or a folder nearer to them"

@@ -187,12 +187,14 @@ class DisparityMaps(Table):
     Attributes
     ----------
     left : pattern of the maps, one a pair, named or numbered as the left images are: .pfm, .tif or .npy of floating
-        point (px; 0, infinite or NaN: unknown), or 16-bit .png (256 a pixel, 0 unknown).
+        point (px; 0, infinite or NaN: unknown), 16-bit .png (256 a pixel, 0 unknown), or other integers.
+    scale : values for a pixel; by default by the kind of file (1, 256), none of other integers.
     sign : left-right: values are the column in the left image minus that in the right one, the usual; right-left: the
         reverse.
     """
 
     left: str
+    scale: float | None = Field(default=None, gt=0, le=1e6)
     sign: Literal["left-right", "right-left"] = "left-right"
 
 
@@ -238,8 +240,7 @@ class Times(Table):
 
     @model_validator(mode="after")
     def _one_source(self) -> Times:
-        given = [self.file is not None, self.names, self.rate_hz is not None]
-        if sum(given) != 1:
+        if [self.file is not None, self.names, self.rate_hz is not None].count(True) != 1:
             raise ValueError("give one of file, names = true or rate_hz")
         return self
 
@@ -463,13 +464,10 @@ class Manifest(Table):
     notes: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _one_rotation(self) -> Manifest:
+    def _one_rotation_and_a_whole_place(self) -> Manifest:
         if self.attitude is not None and self.imu is not None:
             raise ValueError("[attitude] and [imu] both state the rotation: remove one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _crs_alone_is_that_of_positions(self) -> Manifest:
+        # A CRS alone is that of positions.
         if self.world.crs is not None and self.world.missing and self.positions is None:
             raise ValueError("world: a place needs crs, origin and azimuth_deg: origin and azimuth_deg missing")
         return self

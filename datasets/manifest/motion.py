@@ -28,6 +28,7 @@ from rille.datasets.poses import (
     positions_of,
     read_motion,
     refuse_apart,
+    week_of,
 )
 from rille.datasets.text.columns import columns_of_places, meanings, unread_rotations
 from rille.datasets.text.names import ends
@@ -283,11 +284,11 @@ class MotionReader:
     def truth(self, section: model.Truth) -> None:
         """Read true poses of each pair, or true positions with their own times."""
         rows = self.table(section.file, section.format)
+        self.doubt_clock(section, rows)
         alone = positions_of(rows, section.format, section.columns, section.unit)
         kind = "positions" if alone else "poses"
         self.state(truth_source=section.source or f"{kind} of {section.file}, as recorded")
         if alone is not None:
-            self.doubt_clock(section, rows)
             self.state(truth_positions=self.true_positions(section, alone))
             self.warn(() if section.columns else unread_rotations(rows))
             return
@@ -366,12 +367,17 @@ class MotionReader:
         raise IncompleteError("RIL-803", text, remedy=remedy)
 
     def doubt_clock(self, section: model.Recorded, table: TextTable) -> None:
-        """Warn of times since 1970 that are called GPS time, unless an offset is stated."""
-        column = meanings(table).get("time", -1)
-        named = column >= 0 and table.header and GPS_TIME.fullmatch(unitless(table.header[column]))
-        if named and section.time_offset == 0.0 and (table.values([column]) > 1e9).all():
-            text = f"{section.file}: its times are called GPS time, which is 18 s ahead of UTC"
-            self.warn((warning("RIL-785", f"{text}: if those of the images are UTC, state time_offset = -18"),))
+        """Warn of times since 1970 that are called GPS time, and of GPS weeks, unless an offset is stated."""
+        column = meanings(table).get("time")
+        if section.time_offset != 0.0 or column is None:
+            return
+        named = GPS_TIME.fullmatch(unitless(table.header[column])) and (table.values([column]) > 1e9).all()
+        what, other, offset = "its times are called GPS time, which is 18 s ahead of UTC", "UTC", -18
+        if weeks := week_of(table, column) is not None:
+            what, other, offset = "its GPS weeks are read as UTC, 18 s less", "GPS time", 18
+        if weeks or named:
+            text = f"{section.file}: {what}: if those of the images are {other}, state time_offset = {offset}"
+            self.warn((warning("RIL-785", text),))
 
     def measured(self, section: model.PositionFile) -> None:
         """Read measured positions, in metres, at times (s) of the images' clock; at numbers of pairs without a clock.

@@ -72,12 +72,12 @@ def open_described(manifest: Manifest, root: Path, name: str, digests: files.Dig
 def _described(manifest: Manifest, root: Path, digests: files.Digests) -> Sequence:
     base, pairs = _of_bag(manifest, root) or _of_files(manifest, root, digests)
     if manifest.disparity is not None:
-        note = f"disparities are those of {manifest.disparity.left}, made by another program, and checked"
-        disparity, absent = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
+        disparity, absent, scale = _disparity("disparity", manifest.disparity, root, base, pairs, digests)
+        note = f"disparities are those of {manifest.disparity.left}{scale}, made by another program, and checked"
         base = replace(base, disparity=disparity, lost={**absent, **base.lost}, notes=(*base.notes, note))
     if manifest.truth_disparity is not None:
-        exact, absent = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
-        note = f"true disparities are those of {manifest.truth_disparity.left}; they only judge"
+        exact, absent, scale = _disparity("truth_disparity", manifest.truth_disparity, root, base, pairs, digests)
+        note = f"true disparities are those of {manifest.truth_disparity.left}{scale}; they only judge"
         if absent:
             note += f" {len(pairs) - len(absent)} of {len(pairs)} pairs: {next(iter(absent.values()))}"
 
@@ -151,9 +151,9 @@ def _disparity(
     sequence: Sequence,
     pairs: tuple[ImagePair, ...],
     digests: files.Digests,
-) -> tuple[Callable[[int], Source], dict[int, str]]:
-    """Function that returns the source of another program's, or of the true disparity of a frame; and why frames have
-    none. ``key``: name of the table."""
+) -> tuple[Callable[[int], Source], dict[int, str], str]:
+    """Function that returns the source of another program's, or of the true disparity of a frame; why frames have none;
+    and a remark on the scale of the maps. ``key``: name of the table."""
     if sequence.lenses:
         text = f"[{key}] needs images without distortion: maps are of undistorted, rectified images"
         remedy = f"give the images that the maps were made of (images.rectified = true), or leave [{key}] out"
@@ -165,21 +165,27 @@ def _disparity(
     if isinstance(claimed, str):
         maps["disparity_std"] = disparities.find(claimed, root, lefts, f"{key}.sigma")
     size = sequence.rig.left.width, sequence.rig.left.height
-    common = {"size": list(size), "sign": stated.sign, "sigma": sigma}
-    bad = {left: error for of in maps.values() for left, error in disparities.refused(of, size).items()}
+    common, turn = {"size": list(size), "sigma": sigma}, -1.0 if stated.sign == "left-right" else 1.0
+    read = {a: disparities.scales(of, size, None if a == "disparity_std" else stated.scale) for a, of in maps.items()}
+    bad = {left: scale for of in read.values() for left, scale in of.items() if isinstance(scale, InputError)}
+    scales = {a: {k: s for k, s in of.items() if not isinstance(s, InputError)} for a, of in read.items()}
     if bad and not set.intersection(*map(set, maps.values())) - bad.keys():
         raise next(iter(bad.values()))
 
     def source(frame: int) -> Source:
         paths = {array: of[pairs[frame].left] for array, of in maps.items()}
-        args = {**common, "frame": frame, "digests": {array: digests.sha256(path) for array, path in paths.items()}}
+        digest = {array: digests.sha256(path) for array, path in paths.items()}
+        scale = {array: of[pairs[frame].left] for array, of in scales.items()}
+        scale["column_disparity"] *= turn
+        args = {**common, "frame": frame, "digests": digest, "scales": scale}
         hints = {"paths": {array: str(path.resolve()) for array, path in paths.items()}}
         return Source("rille.datasets.images.disparities", NoParams(), args, hints)
 
     absent = {left: f"{error.message} ({key})" for left, error in bad.items()}
     lacking = (pair.left for pair in pairs if any(pair.left not in of for of in maps.values()))
     absent |= {left: f"the map of {left.name} ({key}) is missing" for left in lacking}
-    return source, {k: absent[pair.left] for k, pair in enumerate(pairs) if pair.left in absent}
+    remark = "".join(f" ({s:g} values a pixel)" for s in sorted({*scales["column_disparity"].values()} - {1.0}))
+    return source, {k: absent[pair.left] for k, pair in enumerate(pairs) if pair.left in absent}, remark
 
 
 def default_name(path: Path) -> str:

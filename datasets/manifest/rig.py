@@ -27,11 +27,11 @@ LONGEST_BASELINE = 20.0
 USUAL_VIEW_DEG = (5.0, 150.0)
 """degrees; horizontal angle of view."""
 
-STREET = {"locus.cell_size": 0.1}
-"""0.1 m resolves kerbs as far as the disparity does."""
 
-CAR = 0.3
-"""m, least baseline of a rig on a car; for shorter ones the cell size follows from the resolution of the pixels."""
+def street_defaults(rig: Rig) -> dict[str, float]:
+    """Parameters for a rig on a car, by its baseline; of others the cell size follows from the resolution of pixels."""
+    # 0.1 m resolves kerbs as far as the disparity does.
+    return {"locus.cell_size": 0.1} if rig.baseline >= 0.3 else {}
 
 
 @dataclass(frozen=True)
@@ -229,6 +229,10 @@ def check_baseline(baseline: float, section: RigSection) -> list[str]:
 def unusual_cameras(cameras: tuple[CalibratedCamera, CalibratedCamera], sizes: Sizes) -> tuple[str, ...]:
     """Warnings about a left and a right camera that are possible but unusual for images of these sizes."""
     lines = []
+    bare = [side for side, camera in zip(("left", "right"), cameras, strict=True) if camera.lens.model == "none"]
+    if len(bare) == 1 and not all(camera.lens.ideal for camera in cameras):
+        text = f"of the {bare[0]} camera no distortion is stated, of the other one it is: it is taken as free of it"
+        lines.append(warning("RIL-105", f"{text}; state its coefficients, or zeros if that is so"))
     for side, calibrated, (width, height) in zip(("left", "right"), cameras, sizes, strict=True):
         c = calibrated.lens.camera
         view = math.degrees(2 * math.atan(width / 2 / c.fx))

@@ -17,7 +17,12 @@ UNTIMED = (*POSITION, "qx", "qy", "qz", "qw")
 """Order of the columns without names, one row a frame."""
 
 WORDS = (
-    (r"((gps|utc|_)[_. ]?)?(t|time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|tow|.*[./]stamp([./]secs?)?", "time"),
+    (
+        r"((gps|utc|_)[_. ]?)?(t|(date)?time(stamp)?|stamp|secs?|(nano)?seconds)|utc|gpst|.*[./]stamp([./]secs?)?",
+        "time",
+    ),
+    (r"(gps|gnss)?[_. ]?(i?tow|sow|(gps)?sec(ond)?s?[_. ]?of[_. ]?(the[_. ]?)?week|time[_. ]?of[_. ]?week)", "time"),
+    (r"(gps|gnss|gpst)?[_. ]?(week|wn|wno)([_. ]?(no|num|number))?", "week"),
     # ROS tools write the path of a field before its name.
     (r"(.*[./])?(q|r|quat|quaternion|orientation|rot|rotation|q_rs)[_./ ]?([wxyz])", r"q\3"),
     (r"(?:p|t|pos|position|trans|translation|p_rs_r|p_rs)?[_. ]?([xyz])", r"\1"),
@@ -56,6 +61,11 @@ def meanings(table: TextTable) -> dict[str, int]:
         meant = next((match.expand(meaning) for match, meaning in matches if match), None)
         if meant is not None:
             columns.setdefault({"lat": "y", "lon": "x"}.get(meant, meant) if table.crs else meant, k)
+    if table.header[:1] == ("date",):
+        columns.setdefault("time", 0)
+    # Trackers of positions alone write zeros.
+    if columns.keys() >= set(QUATERNION) and not table.values([columns[q] for q in QUATERNION]).any():
+        columns = {name: k for name, k in columns.items() if name not in QUATERNION}
     bare = [unitless(name) for name in table.header]
     heights = [k for k, name in enumerate(bare) if name in ("u", "d")]
     if {"e", "n"} <= set(bare) and heights:  # beside others they may mean anything

@@ -73,7 +73,8 @@ def by_one_word(names: Sequence[str], *, timed: bool = False) -> dict[str, list[
     longest = max(map(len, words), default=0)
     # Of names with unlike numbers of words the last ones are compared, if the first tell nothing: a_b/cam_3, c/cam_3.
     behind = [[""] * (longest - len(split)) + split for split in words]
-    return _by_one_word(words, timed) or (_by_one_word(behind, timed) if behind != words else {})
+    finer = [re.split(r"(\d+)", "".join(split)) for split in words]  # img0000c1
+    return next(filter(None, (_by_one_word(of, timed) for of in (words, behind, finer))), {})
 
 
 def _by_one_word(words: Sequence[list[str]], timed: bool) -> dict[str, list[int]]:

@@ -74,7 +74,7 @@ class TextTable:
 
     def values(self, columns: Sequence[int]) -> Floats:
         """Columns as numbers (rows, columns); NaN for missing values, infinity for other texts."""
-        return np.array([[_number(row[column]) for column in columns] for row in self.rows])
+        return np.array([[number(row[column]) for column in columns] for row in self.rows])
 
     def measured(self, columns: Sequence[int], lost: AnyArray | bool = False) -> tuple[TextTable, tuple[str, ...]]:
         """The table without rows that lack a value in a column, repeat the row before, or are ``lost``, and a warning.
@@ -127,7 +127,7 @@ class TextTable:
         return values
 
 
-def _number(cell: str) -> float:
+def number(cell: str) -> float:
     """Number of a cell; NaN for a missing value, infinity for any other text."""
     try:
         return math.nan if cell.lower() in ("", "-", "na", "n/a", "null", "none") else float(cell)

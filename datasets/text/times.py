@@ -22,6 +22,11 @@ UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 UPPER = {"s": 1e11, "ms": 1e14, "us": 1e17}
 """Largest value in each unit: 1e11 s after 1970 is the year 5138."""
 
+GPS_EPOCH = 315964782
+"""s from 1970 to 1980, where GPS time begins, less its 18 leap seconds since."""
+
+SECONDS_OF_WEEK = 604_800
+
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d([-_/:]?)\d\d\2\d\d)[-_T ]?(\d\d([-_:]?)\d\d\4\d\d)"
     r"(?:\.(\d+)|[-_]?(\d{3}|\d{6}))?(Z|\+\d\d:?\d\d|-\d\d:\d\d| [-+]\d\d:?\d\d)?(?!\d)"
@@ -45,6 +50,17 @@ def undated(text: str) -> str:
 def of_two(whole: str, nanoseconds: str) -> str:
     """Seconds of a stamp in two cells, as of ROS; no number if these are none."""
     return f"{whole}.{nanoseconds:0>9}" if (whole + nanoseconds).isdecimal() else f"{whole} {nanoseconds}"
+
+
+def of_week(week: str, time: str, per_second: int) -> str:
+    """Seconds since 1970, UTC, of a GPS week and the time in it, ``per_second`` of a unit; no number if these are none.
+
+    >>> of_week("2123", "44818.5", 1)
+    '1600000000.5'
+    """
+    with suppress(ArithmeticError):
+        return str(GPS_EPOCH + SECONDS_OF_WEEK * Decimal(week) + Decimal(time) / per_second)
+    return f"{week} {time}"
 
 
 def seconds(

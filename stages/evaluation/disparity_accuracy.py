@@ -86,7 +86,7 @@ def disparity_accuracy_stage(
     if np.count_nonzero(np.isfinite(error)) >= 100 and isinstance(wrong, float) and wrong > 0.75:
         facts["warnings"] = [
             f"the true disparities contradict the matches, of which {1.0 - wrong:.0%} fit them: check truth_disparity: "
-            "sign, unit (SGBM counts in sixteenths), an offset of the principal points, the order of rows (PFM has the "
+            "sign, scale (of SGBM 16), an offset of the principal points, the order of rows (PFM has the "
             "lowest first), and that each is of its left image"
         ]
     return Bundle({"error": error}, facts)

@@ -71,7 +71,7 @@ def place(a: Grid, b: Grid) -> Placement:
     # Half as many agree on another place: both are possible.
     if rival.sum() > 0.5 * agreeing and away > 2.0 * near:
         text = f"the ortho image fits two places: {agreeing} and {rival.sum()} keypoints agree, {away:.3g} m apart"
-        raise DegenerateError("RIL-841", text, remedy="give images of more ground, or a start")
+        raise DegenerateError("RIL-841", text, remedy="show more ground than what repeats; localize takes --near")
     arm = p[used] - start
     spread = float(np.sqrt(np.mean((q[used] - middle - arm @ turn.T) ** 2)))
     sigma = spread / np.sqrt([agreeing, agreeing, float((arm**2).sum())])

@@ -421,6 +421,39 @@ def test_kalibr_by_the_imu_in_either_direction_or_both(tmp_path):
         rig(("T_x", a.inverse()), ("T_x", b.inverse()), name="camera_")
 
 
+@pytest.mark.parametrize("form", ["okvis", "svo"])
+def test_a_list_of_cameras_says_what_a_chain_says(tmp_path, form):
+    size, optics, bent = [752, 480], [458.6, 457.3, 367.2, 248.4], [-0.28, 0.07, 0.0002, 2e-05]
+    chain, cameras = {}, []
+    for n, at in enumerate((0.0, 0.11)):
+        pose = [1, 0, 0, at, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+        chain[f"cam{n}"] = {"resolution": size, "intrinsics": optics, "distortion_coeffs": bent, "T_BS": pose}
+        if form == "okvis":
+            one = {"T_SC": pose, "image_dimension": size, "focal_length": optics[:2], "principal_point": optics[2:]}
+            one |= {"distortion_coefficients": bent, "distortion_type": "radialtangential"}
+        else:
+            lens = {"type": "radial-tangential", "parameters": {"cols": 1, "rows": 4, "data": bent}}
+            inner = {"image_height": 480, "image_width": 752, "type": "pinhole", "distortion": lens}
+            inner["intrinsics"] = {"cols": 1, "rows": 4, "data": optics}
+            one = {"camera": inner, "T_B_C": {"rows": 4, "cols": 4, "data": pose}}
+        cameras.append(one)
+    wanted = rig_of(*read_cameras(written(tmp_path, json.dumps(chain), "chain.json")))
+    rig, lenses = rig_of(*read_cameras(written(tmp_path, json.dumps({"cameras": cameras}))))
+    assert rig.baseline == pytest.approx(0.11)
+    assert (rig.left, rig.right, lenses) == (wanted[0].left, wanted[0].right, wanted[1])
+    del cameras[1]["focal_length" if form == "okvis" else "camera"]
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, json.dumps({"cameras": cameras})))
+
+
+@pytest.mark.parametrize("listed", [[], ["left", "right"], [{}, {}]])
+def test_a_list_of_other_things_is_none_of_cameras(tmp_path, listed):
+    figures = {"fx": 458, "fy": 457, "cx": 367, "cy": 248, "baseline": 0.11}
+    assert len(read_cameras(written(tmp_path, json.dumps({"cameras": listed} | figures)))) == 2
+    with raises("RIL-100"):
+        read_cameras(written(tmp_path, json.dumps({"cameras": listed})))
+
+
 def test_kalibr_of_one_camera(tmp_path):
     """It stands where the IMU says, or nowhere: in a chain of one camera no link is missing."""
     one = "cam0: {{intrinsics: [190, 190, 250, 250], resolution: [512, 512]{}}}\n"
@@ -710,6 +743,8 @@ T44 = np.block([[ROTATION, SHIFT[:, None]], [np.zeros(3), 1.0]]).tolist()
         (TWO | {"stereo_pose": np.array(T44)[:3].tolist()}, "stereo_pose"),
         (ONE | {"rmat": ROTATION.ravel().tolist(), "baseline": 0.12}, "rmat"),
         (TWO | {"om": [0, 0.1, 0], "T": SHIFT.tolist()}, "om"),
+        (TWO | {"T": SHIFT.tolist(), "rpy": [0.1, 0, 0]}, "rpy"),
+        ({"calibration_parameters": ONE | {"stereo_transform": {"rotation": [0, 0.1, 0]}}}, "stereo_transform"),
     ],
 )
 def test_a_pose_under_another_key_is_refused_beside_matrices_too(tmp_path, stated, key):
@@ -910,6 +945,16 @@ def test_orbslam2_baseline_times_fx_of_either_sign(tmp_path, bf):
     assert lenses is None
 
 
+@pytest.mark.parametrize("nested", [False, True])
+def test_stella_vslam_has_the_same_under_other_names(tmp_path, nested):
+    stated = {"fx": 969, "fy": 970, "cx": 635.1, "cy": 463.5, "k1": 0.0, "cols": 1280, "rows": 960}
+    stated["focal_x_baseline"] = 226.746
+    text = json.dumps({"Camera": stated} if nested else {f"Camera.{key}": value for key, value in stated.items()})
+    rig, _ = rig_of(*read_cameras(written(tmp_path, text)))
+    np.testing.assert_allclose(rig.T_right_left.translation, [-0.234, 0, 0])
+    assert rig.left == Camera(969, 970, 635.1, 463.5, 1280, 960)
+
+
 def test_orbslam2_of_one_camera(tmp_path):
     (camera,) = read_cameras(written(tmp_path, f"{ORB}Camera.k1: 0.1\nCamera.k3: 0.2\n", "mono.yaml"))
     assert camera.lens == Lens(Camera(969, 970, 635.1, 463.5, *UNKNOWN_SIZE), "radtan", (0.1, 0, 0, 0, 0.2))
@@ -944,6 +989,16 @@ right:
   model: pinhole_radial_tangential
   radial_tangential: {radial: [-0.36, 0.17], t1: 0.001, t2: 0.002}
 """
+
+
+@pytest.mark.parametrize(
+    ("radial", "kept"), [("[]", (0, 0)), ("[-0.3]", (-0.3, 0)), ("[-0.3, 0.1, 0.02]", (-0.3, 0.1))]
+)
+def test_boofcv_has_up_to_three_radial_terms(tmp_path, radial, kept):
+    left, _ = read_cameras(written(tmp_path, BOOF.replace("[-0.36, 0.17]", radial)))
+    assert left.lens.coefficients == (*kept, 0.001, 0.002, *((0.02,) if "0.02" in radial else ()))
+    with raises("RIL-370", "radial", "6 coefficients"):
+        read_cameras(written(tmp_path, BOOF.replace("[-0.36, 0.17]", "[-0.3, 0.1, 0.02, 0.3]")))
 
 
 def test_boofcv_right_to_left(tmp_path):
@@ -1332,6 +1387,12 @@ def test_rig_of_cameras_without_size(tmp_path):
     assert (rig.left.width, rig.left.height) == (320, 200)
     # Only the camera that has distortion has a lens.
     assert lenses == {"right": Lens(Camera(500, 500, 320, 240, 320, 200), "radtan", bent)}
+
+
+def test_a_camera_that_is_said_to_have_no_distortion_has_zeros(tmp_path):
+    part = "  intrinsics: [60, 60, 31.5, 23.5]\n  resolution: [64, 48]\n"
+    (tmp_path / "chain.yaml").write_text(f"cam0:\n{part}  distortion_model: none\ncam1:\n{part}")
+    assert [camera.lens.model for camera in read_cameras(tmp_path / "chain.yaml")] == ["radtan", "none"]
 
 
 def test_fisheye_rig_has_the_focal_length_of_its_ideal_camera():

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from raising import raises
 
-from rille.datasets.images.disparities import decode, find
+from rille.datasets.images.disparities import decode, find, scales
 from rille.datasets.images.files import Digests
 from rille.datasets.images.misalign import MisalignParams, misalign
 from rille.datasets.manifest.opening import open_manifest
@@ -73,10 +73,28 @@ def test_all_kinds_read_alike(data):
     np.testing.assert_array_equal(decode(data, COLUMNS_ROWS, "a map"), WANTED)
 
 
-def test_png_has_256_values_a_pixel():
-    values = np.abs(MAP)
-    found = decode(encoded(".png", np.rint(256 * values).astype(np.uint16)), COLUMNS_ROWS, "a map")
-    np.testing.assert_array_equal(found, np.abs(WANTED))
+def test_png_has_256_values_a_pixel(tmp_path):
+    path = tmp_path / "map.png"
+    path.write_bytes(encoded(".png", np.rint(256 * np.abs(MAP)).astype(np.uint16)))
+    [scale] = scales({path: path}, COLUMNS_ROWS, None).values()
+    np.testing.assert_array_equal(decode(path.read_bytes(), COLUMNS_ROWS, "a map", scale), np.abs(WANTED))
+
+
+@pytest.mark.parametrize(
+    ("data", "scale"),
+    [
+        (encoded(".png", np.rint(4 * np.abs(MAP)).astype(np.uint8)), 4),  # Middlebury's quarter
+        (encoded(".tif", np.rint(64 * np.abs(MAP)).astype(np.uint16)), 64),
+        (npy(np.rint(-16 * np.abs(MAP)).astype(np.int16)), -16),  # SGBM's, of the other sign
+    ],
+)
+def test_integers_have_the_scale_that_is_stated(data, scale):
+    np.testing.assert_array_equal(decode(data, COLUMNS_ROWS, "a map", scale), np.abs(WANTED))
+
+
+def test_values_wider_than_the_image_are_no_disparities():
+    with raises("RIL-900", "a map", "scale"):
+        decode(npy(100 * MAP), COLUMNS_ROWS, "a map")
 
 
 class Trap:
@@ -110,9 +128,6 @@ def header(shape):
         (header((6,)), ""),
         (npy(np.array([[Trap()] * 3] * 2, object), allow_pickle=True), "type"),
         (pickle.dumps(Trap()), ""),
-        (npy((16 * MAP).astype(np.int16)), "type"),
-        (encoded(".png", MAP.astype(np.uint8)), "type"),
-        (encoded(".tif", MAP.astype(np.uint16)), "type"),
         (encoded(".png", np.zeros((2, 3, 3), np.uint16)), "type"),
     ],
 )
@@ -210,6 +225,21 @@ def test_a_manifest_names_maps(tmp_path, materialise, more, column, sigma):
     assert any("disp/*.npy" in note for note in s.notes)
 
 
+def test_integers_need_a_scale(tmp_path, materialise):
+    sequence(tmp_path)
+    for k in range(3):
+        (tmp_path / "disp" / f"{k:02d}.npy").unlink()
+        cv2.imwrite(str(tmp_path / "disp" / f"{k:02d}.png"), np.full(SIZE[::-1], 40 * (k + 1), np.uint8))
+    table = '[disparity]\nleft = "disp/*.png"\n'
+    with raises("RIL-900", "00.png", "scale"):
+        open_manifest(write_sequence(tmp_path, table), Digests())
+    s = open_manifest(write_sequence(tmp_path, table + 'scale = 4\nsigma = "sigma/*.npy"\n'), Digests())
+    bundle = materialise(s.disparity(1))
+    assert (bundle["column_disparity"] == -20).all()
+    assert (bundle["disparity_std"] == 20).all()
+    assert any("4 values a pixel" in note for note in s.notes)
+
+
 def test_true_maps_are_no_disparities_of_another_program(tmp_path, materialise):
     sequence(tmp_path)
     path = write_sequence(tmp_path, '[truth_disparity]\nleft = "disp/*.npy"\n')
@@ -258,7 +288,7 @@ def test_maps_are_of_undistorted_and_unmoved_images(tmp_path):
         misalign(open_manifest(plain, Digests()), MisalignParams(rows=2))
 
 
-@pytest.mark.parametrize("line", ["sigma = 0", "sigma = -1.5", 'sign = "up"', "right = 1"])
+@pytest.mark.parametrize("line", ["sigma = 0", "sigma = -1.5", "scale = 0", 'sign = "up"', "right = 1"])
 def test_bad_tables(tmp_path, line):
     with raises("RIL-223", line.split()[0]):
         sequence(tmp_path, f'left = "disp/*.npy"\n{line}')

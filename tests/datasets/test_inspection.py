@@ -199,7 +199,7 @@ def test_patterns_escape_what_is_special(tmp_path):
 
 def test_images_that_cannot_be_told_apart(tmp_path):
     write_images(tmp_path, ["1.png", "2.png"])
-    with raises("RIL-194", "2 images, 0 named as left and 0 as right"):
+    with raises("RIL-194", "2 images (1.png to 2.png), 0 named as left and 0 as right"):
         inspect(tmp_path)
     write_images(tmp_path / "high", ["1.png"], (48, 64))
     with raises("RIL-194", "one above the other, crop=iw:ih/2"):
@@ -278,6 +278,16 @@ def test_a_gap_that_the_manifest_bridges_is_told_and_needs_nothing(tmp_path):
 def test_tables_are_told_by_content(tmp_path, lines, kind):
     write_lines(tmp_path / "table.txt", lines)
     assert table_kind(tmp_path / "table.txt", 2) == kind
+
+
+def test_poses_that_cannot_be_read_are_no_truth_but_are_told(tmp_path):
+    """As Virtual KITTI's, of both cameras."""
+    write_images(tmp_path, both("{side}/{name}.png", ["0", "1"]))
+    rows = [f"{k} {c} 1 0 0 {-0.5 * c} 0 1 0 0 0 0 1 {-k} 0 0 0 1" for k in range(2) for c in range(2)]
+    write_lines(tmp_path / "extrinsic.txt", ["frame camera r1 r2 r3 t1 r4 r5 r6 t2 r7 r8 r9 t3 0 0 0 1", *rows])
+    found = inspect(tmp_path)
+    assert not found.tables
+    assert any("extrinsic.txt" in line and "no pose" in line for line in found.unread)
 
 
 @pytest.mark.parametrize(
@@ -376,6 +386,8 @@ def test_of_several_resolutions_that_of_the_images_is_taken(tmp_path):
     assert found.calibration is not None
     assert (found.calibration.files, found.calibration.cameras) == (("SN1.conf",), 2)
     assert found.calibration.sizes == ((960, 600), (960, 600))
+    assert found.calibration.names == ("left SVGA", "right SVGA")
+    assert found.calibration.among == ("left SVGA", "right SVGA", "left HD", "right HD")
 
 
 def test_scenes_of_two_numbered_cameras_are_sequences_of_their_own(tmp_path):
@@ -429,6 +441,29 @@ def test_kinds_of_images_in_turns_are_one_set(tmp_path):
     assert (views.left, views.right, views.pairs, views.others) == ("left/*", "right/*", 5, ())
     write_images(tmp_path, both("{side}/{name}.jpg", ["1", "3", "5"]))  # each png once more, as a jpg
     assert inspect(tmp_path).views.pairs == 5
+
+
+@pytest.mark.parametrize(("name", "lost"), [("{at}_cam{side}_{time}{k}", 1), ("{at}_{side}_{time}{k}", 0)])
+def test_of_two_pairs_of_cameras_in_one_folder_one_is_taken(tmp_path, name, lost):
+    """Their images have times of their own, so that no names are those of both pairs; one lacks an image."""
+    every = [(at, k, side) for at in (("Loc", 17), ("Pan", 18)) for k in range(3) for side in (0, 1)]
+    names = [name.format(at=at[0], time=at[1], side=side, k=k) for at, k, side in every]
+    write_images(tmp_path, [f"{name}.png" for name in names[2 * lost :]] + lost * [f"{names[1]}.png"])
+    views = inspect(tmp_path).views
+    assert (views.left[:3], views.pairs, len(views.absent)) == (("Pan", 3, 0) if lost else ("Loc", 3, 0))
+    assert any("of another set" in line for line in views.others)
+
+
+def test_a_camera_may_be_numbered_behind_the_frame(tmp_path):
+    write_images(tmp_path, [f"img{k:04d}c{camera}.png" for k in range(3) for camera in (0, 1)])
+    views = inspect(tmp_path).views
+    assert (views.left, views.right, views.pairs) == ("img*c0.png", "img*c1.png", 3)
+
+
+def test_images_and_their_depths_are_no_pairs(tmp_path):
+    write_images(tmp_path, [f"{kind}/{k}.png" for k in range(3) for kind in ("rgb", "depth")])
+    with raises("RIL-194", "6 images"):
+        inspect(tmp_path)
 
 
 def test_of_two_sets_in_one_folder_the_first_is_taken(tmp_path):

@@ -214,6 +214,16 @@ def test_cameras_may_differ(tmp_path):
     assert (rig.left.fx, rig.left.fy, rig.right.fx, rig.right.fy, rig.right.cx) == (60, 60, 61, 62, 30)
 
 
+@pytest.mark.parametrize(
+    ("right", "said"), [("", 1), ("distortion = [0, 0, 0, 0]\n", 0), ("distortion = [0.1, 0, 0, 0]\n", 0)]
+)
+def test_a_distortion_of_one_camera_alone_is_said(tmp_path, right, said):
+    figures = "fx = 60.0\ncx = 31.5\ncy = 23.5\n"
+    cameras = f"[cameras.left]\n{figures}distortion = [0.1, 0, 0, 0]\n[cameras.right]\n{figures}{right}"
+    lines = opened(write_sequence(tmp_path, cameras=cameras)).warnings
+    assert ["RIL-105" in line and "right" in line for line in lines] == [True] * said
+
+
 def smaller_right_images(folder: Path) -> Path:
     """A sequence whose left images have 64 x 48 pixels and whose right ones half as many a side."""
     manifest = write_sequence(folder)
@@ -1033,6 +1043,15 @@ def test_gps_time_is_not_that_of_the_images(tmp_path, table, more, told):
     )
     lines = opened(write_sequence(tmp_path, text)).warnings
     assert [("RIL-785" in line, "time_offset = -18" in line) for line in lines] == [(True, True)] * told
+
+
+def test_gps_weeks_are_said_to_be_read_as_utc(tmp_path):
+    write_lines(tmp_path / "p.csv", ["week,tow,x,y", *(f"2123,{44818 + k},{k},0" for k in range(3))])
+    write_lines(tmp_path / "t.txt", [f"{1600000000 + k}" for k in range(3)])
+    text = '[times]\nfile = "t.txt"\n[positions]\nfile = "p.csv"\nsigma = 0.5\n'
+    [line] = opened(write_sequence(tmp_path, text)).warnings
+    assert "RIL-785" in line
+    assert "time_offset = 18" in line
 
 
 def test_positions_may_be_those_of_poses_with_names(tmp_path):

@@ -298,6 +298,53 @@ def test_a_heading_is_told_to_be_perhaps_a_yaw_that_counts_otherwise(tmp_path, n
         read(tmp_path, f"time,x,y,{name}\n0,0,0,90\n1,1,0,91\n")
 
 
+@pytest.mark.parametrize("header", ["time,pitch_rate,heading", "time,speed,heading"])
+def test_a_heading_without_positions_is_told_too(tmp_path, header):
+    with raises("RIL-264", "yaw_deg", "90 less heading"):
+        read(tmp_path, f"{header}\n" + "".join(",".join([str(k)] * (header.count(",") + 1)) + "\n" for k in range(3)))
+
+
+@pytest.mark.parametrize(
+    ("names", "per_second"),
+    [
+        ("gps_week,tow", 1),
+        ("GPS Week,GPS Seconds", 1),
+        ("WN,iTOW", 1000),
+        ("week_number,time_of_week_ms", 1000),
+        ("GPSWeek,SecondsOfWeek", 1),
+        ("week,sow", 1),
+        ("Week,GPSTime", 1),
+    ],
+)
+def test_gps_weeks_and_times_within_them_are_seconds_since_1970(tmp_path, names, per_second):
+    rows = "".join(f"2123,{(44818 + k / 10) * per_second:.1f},{k},0\n" for k in range(3))
+    path = tmp_path / "gnss.csv"
+    path.write_text(f"{names},x,y\n{rows}")
+    found = positions_of(read_motion(path), "csv", {})
+    assert found.times == pytest.approx([1.6e9, 1.6e9 + 0.1, 1.6e9 + 0.2], abs=1e-6)
+
+
+def test_times_since_1970_beside_gps_weeks_stay_as_they_are(tmp_path):
+    path = tmp_path / "gnss.csv"
+    path.write_text("week,time,x,y\n2123,1600000000,0,0\n2123,1600000001,1,0\n")
+    assert positions_of(read_motion(path), "csv", {}).times == (1.6e9, 1.6e9 + 1)
+
+
+def test_a_tracker_of_positions_alone_writes_zeros_in_the_place_of_a_quaternion(tmp_path):
+    path = tmp_path / "prism.csv"
+    path.write_text("time,x,y,z,qx,qy,qz,qw\n1,2,3,4,0,0,0,0\n2,3,4,5,0,0,0,0\n")
+    assert positions_of(read_motion(path), "auto", {}).positions == ((2, 3, 4), (3, 4, 5))
+
+
+def test_a_first_column_of_dates_is_the_time(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("date;x;y\n2020-09-13T12:26:40.5Z;1;2\n2020-09-13T12:26:41Z;2;2\n")
+    assert positions_of(read_motion(path), "auto", {}).times == (1600000000.5, 1600000001.0)
+    path.write_text("date,x,y\n09/13/2020 12:26:40,1,2\n09/13/2020 12:26:41,2,2\n")
+    with raises("RIL-291", "09/13/2020"):
+        positions_of(read_motion(path), "auto", {})
+
+
 def test_units_below_the_names_do_not_exchange_the_parts_of_a_quaternion(tmp_path):
     rows = "1,0,0,0,0.1,0.2,0.3,0.927\n2,0,0,0,0.1,0.2,0.3,0.927\n"
     plain, with_units = (read(tmp_path, f"time,x,y,z,qx,qy,qz,qw\n{units}{rows}") for units in ("", "s,m,m,m,,,,\n"))
@@ -391,7 +438,7 @@ def test_positions_of_rtklib(tmp_path):
         positions_of(read_motion(path), "auto", {})
     path.write_text("%  GPST   latitude(deg) longitude(deg) height(m) Q\n2123 388800.5 48.1 9.0 500 1\n")
     found = positions_of(read_motion(path), "auto", {})
-    assert (found.times, found.positions[0][2]) == ((388800.5,), 500)
+    assert (found.times, found.positions[0][2]) == ((1600343982.5,), 500)
 
 
 @pytest.mark.parametrize("names", ["x,y,z", "ecef_x,ecef_y,ecef_z", "x-ecef(m),y-ecef(m),z-ecef(m)"])

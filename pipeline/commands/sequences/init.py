@@ -88,7 +88,8 @@ def _report(findings: Findings, path: Path, needed: list[str]) -> list[str]:
     lines += [f"pairs        {line}" for line in views.lines]
     if calibration is not None:
         baseline = f", baseline {calibration.baseline:.6g}" if calibration.baseline is not None else ""
-        lines.append(f"calibration  {' and '.join(calibration.files)}{baseline}")
+        two = f", {' and '.join(calibration.names)} of {', '.join(calibration.among)}" if calibration.names else ""
+        lines.append(f"calibration  {' and '.join(calibration.files)}{two}{baseline}")
     tables = {**findings.tables, **({"masks": findings.masks.values()} if findings.masks else {})}
     tables |= {"vehicle": [VEHICLE_FILE]} if findings.vehicle else {}
     lines += [f"{kind:12s} {', '.join(files)}" for kind, files in tables.items()]

@@ -78,7 +78,7 @@ LIMITS = (
         "borne out",
         "matching",
         least=0.1,
-        remedy="are the maps of these left images, in pixels (SGBM counts in sixteenths), of this sign, and their "
+        remedy="are the maps of these left images, of this scale (SGBM's is 16) and sign, and their "
         "rows in order (PFM has the lowest first)?",
     ),
     Fault(

@@ -94,7 +94,7 @@ def test_an_image_that_fits_two_places_is_refused():
     # Of twins a keypoint's second best match is as good as its best: noise tells half of them apart.
     twice[:, :150] += np.random.default_rng(4).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 < 25)
     twice[:, 150:] += np.random.default_rng(5).normal(0, 12, (150, 150)) * (np.indices((150, 150))[0] % 50 >= 25)
-    with raises("RIL-841", "two places"):
+    with raises("RIL-841", "two places", "--near"):
         place(a, Grid(twice, b.matrix))
 
 
