@@ -68,7 +68,7 @@ class Stance(NamedTuple):
         # Order of the wheels in all arrays: front left, front right, rear left, rear right.
         half = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [-1.0, 1.0]]) / 2.0  # ahead, right
         wheels = half * [vehicle.wheel_base, vehicle.track]
-        width = vehicle.belly_width
+        width = max(vehicle.track - vehicle.wheel_width, vehicle.wheel_width)
         parts = _parts(vehicle.wheel_base, width), _parts(width, vehicle.wheel_base)
         ahead, right = ((np.arange(n) + 0.5) / n - 0.5 for n in parts)
         share = np.stack(np.meshgrid(ahead, right, indexing="ij"), axis=-1).reshape(-1, 2)

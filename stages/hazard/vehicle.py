@@ -43,11 +43,6 @@ class Vehicle(Params):
         return 0.5 * self.wheel_diameter
 
     @property
-    def belly_width(self) -> float:
-        """Metres between the inner faces of the wheels; at least that of a wheel."""
-        return max(self.track - self.wheel_width, self.wheel_width)
-
-    @property
     def half_width(self) -> float:
         """Metres from the middle line to the outer face of the wheels."""
         return 0.5 * (self.track + self.wheel_width)

@@ -137,7 +137,7 @@ def measured(ground: HeightGrid, x: Floats, y: Floats, heading: Floats, vehicle:
     middle = z.mean(axis=1)
     # Nine samples along either side.
     half = np.linspace(-0.5, 0.5, 9)
-    across, along = np.meshgrid(half * vehicle.belly_width, half * vehicle.wheel_base)
+    across, along = np.meshgrid(half * (vehicle.track - 0.2 * vehicle.wheel_diameter), half * vehicle.wheel_base)
     belly = np.stack([across.ravel(), along.ravel()], axis=1)
     plane = middle[:, None] + lean[:, None] * belly[:, 0] + rise[:, None] * belly[:, 1]
     # The wheels stand at a mean height of ``middle``: least squares through four corners of a rectangle are its means.

@@ -14,7 +14,7 @@ from rille.pipeline.engine.run import Result, RunOptions, run
 from rille.pipeline.engine.store.base import Store, StoreError
 from rille.pipeline.flow import unread
 from rille.pipeline.flow.builders import Builder, name_graph
-from rille.pipeline.runs.checks.inspection import Inspection
+from rille.pipeline.runs.checks.flow import CheckFlow
 from rille.pipeline.runs.checks.limits import Finding
 from rille.pipeline.runs.crate import resolved
 from rille.pipeline.runs.options import COMPLETE, FAILED, Settings, cache_folder
@@ -56,13 +56,13 @@ def inspect(sequence: Sequence, config: Any, frames: tuple[int, ...], cache: Pat
             kept.append(Finding("", f"{error.message}: what is computed is not kept", "cache"))
             store = Store(ends.enter_context(TemporaryDirectory(prefix="rille-")))
         name_graph(graph, sequence, frames)
-        inspection = Inspection(Builder(graph, sequence, config), frames, store)
-        inspection.say(*kept)
-        graph.flow(inspection.steps())
+        checking = CheckFlow(Builder(graph, sequence, config), frames, store)
+        checking.say(*kept)
+        graph.flow(checking.steps())
         # In this process, because the start of workers would take longer than most tasks.
         result = run(graph, store, RunOptions(executor="inline", keep_going=True))
     # Errors of stages are findings, already printed; any other failure is a fault of the program.
     Result(failures=[f for f in result.failures if not (f.stage and isinstance(f.error, RilleError))]).check()
-    levels = inspection.levels
+    levels = checking.levels
     print(f"{sequence.name}: {levels['FAIL']} fail, {levels['WARN']} to look at, {levels['OK']} fine")
     return FAILED if levels["FAIL"] else COMPLETE

@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -42,15 +41,10 @@ from rille.stages.terrain.locus.kernel import Dem
 from rille.stages.terrain.locus.refinement import refine
 from rille.stages.terrain.locus.solve import LocusParams, cameras_of, join, observed, solve
 from rille.stages.terrain.locus.uncertainty import HOLE_SIDE_CELLS, NEAR_SIDE_CELLS, standard_deviation
-from rille.stages.terrain.locus.views import SurfaceViews, View, facing
+from rille.stages.terrain.locus.views import SurfaceViews, View, edge_on, facing
 from rille.stages.terrain.matches import Matches
 
 NO_LIMIT = {"max_sigma": None}
-
-LEAST_FACING = 0.3
-"""Least area of ground in the left image, over that of level ground there (:func:`rille.stages.terrain.locus.views.
-facing`). Less is mostly no ground: a match is that of a window, and so is what joins the edge of a stone to the ground
-behind it, seen edge-on and above what the stone hides."""
 
 
 @dataclass(frozen=True)
@@ -143,9 +137,7 @@ def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams
     dem.elevation_std[...] = standard_deviation(elevation, seen, turned, moved, apart, dem.elevation_std)
     dem.elevation[...] = elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)
-    # Closed, since between the near and the far end of such ground the slope is that of noise.
-    edge_on = (turned < LEAST_FACING).astype(np.uint8)
-    _leave_out(dem, cv2.morphologyEx(edge_on, cv2.MORPH_CLOSE, np.ones((HOLE_SIDE_CELLS,) * 2, np.uint8)) != 0)
+    _leave_out(dem, edge_on(turned, HOLE_SIDE_CELLS))
 
 
 def greatest_std(params: LocusParams, measured: bool) -> float | None:

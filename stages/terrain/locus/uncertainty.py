@@ -18,7 +18,8 @@ unknown share of 7 x 7 cells; a matching window beside hidden ground is the mean
 both directions of matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX` where none of them has both; 0 where
 there was one direction.
 
-v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen.
+v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen,
+and what is below .3 is left out (:func:`rille.stages.terrain.locus.views.edge_on`).
 Where v is small a matching window covers more ground, some of which hides other ground.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both

@@ -15,9 +15,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from rille.stages.core.arrays import Floats, Floats32
+from rille.stages.core.arrays import Bools, Floats, Floats32
 from rille.stages.core.kernel import kernel
 from rille.stages.geometry.lattice import Lattice
 from rille.stages.geometry.spline import value_and_gradient
@@ -85,6 +86,20 @@ def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> 
     dx, dy, below = lattice.xs() - centre[0], lattice.ys()[:, None] - centre[1], elevation - centre[2]
     share = 1.0 - (dx * ahead[0] + dy * ahead[1]) / below
     return np.where(np.isfinite(share), share, 1.0).astype(np.float32)
+
+
+LEAST_FACING = 0.3
+"""Least area of ground in the image over that of level ground. Less is mostly no ground: a match is that of a window,
+and so is what joins the edge of a stone to the ground behind it, seen edge-on and above what the stone hides."""
+
+
+def edge_on(area: Floats32, side: int) -> Bools:
+    """Cells (rows, cols) that the camera sees edge-on, by their area in the image (:func:`facing`).
+
+    Gaps of less than ``side`` cells between them count as well: the slope there is that of noise.
+    """
+    found = (area < LEAST_FACING).astype(np.uint8)
+    return np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) != 0)
 
 
 @kernel

@@ -30,7 +30,7 @@ from rille.stages.odometry.frame_screening import unlike_sides
 Steps = Generator[Wait, Any, None]
 
 
-class Inspection:
+class CheckFlow:
     """A flow that prints each finding as soon as it is known."""
 
     def __init__(self, make: Builder, frames: tuple[int, ...], store: Store) -> None:
