@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rille.stages.core.arrays import Bytes, Floats
+from rille.stages.core.arrays import Bytes
 from rille.stages.core.declare import Bundle, NoParams, stage
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.imaging.pyramid import grey
@@ -27,7 +27,7 @@ MAX_GREY_ROWS = 0.1
 """Share of the rows of an image with one grey value, beyond those of the other image, that is no chance."""
 
 MIN_NOISE_SHARPNESS, MIN_NOISE_DETAIL = 4.3, 0.18
-"""Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`glance`); photographs have a
+"""Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`texture`); photographs have a
 sharpness of about 1, or, with strong noise, a smaller detail: their grey values deviate by more than the noise."""
 
 STRIP_ROWS = 32
@@ -41,51 +41,50 @@ ALONG = {"sharpness": (1, 1), "sharpness_rows": (1, 0), "sharpness_columns": (0,
 """Directions (column, row) in which sharpness is measured: motion blurs an image along one of them alone."""
 
 
-def _texture(image: NDArray[Any], valid: Bytes) -> Floats:
-    """Mean squares of an image (row, col) over its usable pixels, where ``valid`` is not zero: (7,) grey levels.
+def texture(image: NDArray[Any], valid: Bytes) -> tuple[tuple[float, ...], float]:
+    """Sharpness (both ways, along rows, along columns) and detail of an image (row, col); ``valid`` not zero where
+    usable. NaN: no pixel is usable.
 
-    Of the detail between one and two pixels, by :data:`ALONG`; between two and four; and of all of it, less the mean.
+    Sharpness is the detail between one and two pixels over that between two and four, RMS: it hardly depends on the
+    scene, but decreases with blur. Detail is the latter, both ways, over the standard deviation: without it noise alone
+    determines the sharpness.
     """
     level = grey(image)
     usable = (valid != 0) & np.isfinite(level)
-    if not usable.any():
-        return np.full(2 * len(ALONG) + 1, np.nan)
     inner = None
     if not usable.all():
+        if not usable.any():
+            return (math.nan,) * len(ALONG), 0.0
         level = np.where(usable, level, level[usable].mean())
         # Three standard deviations of the wider blur, within which the mask changes the result.
         inner = cv2.erode(usable.astype(np.uint8), np.ones((13, 13), np.uint8))
-    count = max(level.size if inner is None else int(np.count_nonzero(inner)), 1)
-    fine, coarse = list[float](), list[float]()
+    count = math.sqrt(max(level.size if inner is None else int(np.count_nonzero(inner)), 1))
+    scales = list[tuple[float, float]]()
     for x, y in ALONG.values():
         # 1e-3 pixels: no blur in that direction.
         once, twice = (cv2.GaussianBlur(level, (0, 0), max(s * x, 1e-3), None, max(s * y, 1e-3)) for s in (1.0, 2.0))
-        fine.append(cv2.norm(level, once, cv2.NORM_L2, inner) ** 2 / count)
-        coarse.append(cv2.norm(once, twice, cv2.NORM_L2, inner) ** 2 / count)
-    deviation = cv2.meanStdDev(level, mask=None if inner is None else usable.astype(np.uint8))[1][0, 0]
-    return np.array([*fine, *coarse, deviation**2])
+        fine, coarse = (cv2.norm(a, b, cv2.NORM_L2, inner) / count for a, b in ((level, once), (once, twice)))
+        scales.append((fine, coarse))
+    deviation = float(cv2.meanStdDev(level, mask=None if inner is None else usable.astype(np.uint8))[1][0, 0])
+    sharpness = tuple(fine / coarse if coarse > 0 else math.nan for fine, coarse in scales)
+    return sharpness, scales[0][1] / deviation if deviation > 0 else 0.0
 
 
 def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
     """Figures of an image (row, col); ``valid`` not zero where usable.
 
     ``mean`` (None: no pixel is usable) and ``deviation``, grey 0..255; shares ``dark`` and ``bright`` of clipped
-    pixels; ``sharpness``, also along ``_rows`` and ``_columns`` (None: unknown), and ``detail``; ``digest`` of the
-    pixels; if large, share ``grey_rows`` of the rows that have one value, neither black nor white.
-
-    Sharpness is the detail between one and two pixels over that between two and four, RMS: it hardly depends on the
-    scene, but decreases with blur. Detail is the latter, both ways, over the standard deviation: without it noise alone
-    determines the sharpness. Both are of strips; one that shows little, as the sky, has little part in them.
+    pixels; of strips ``sharpness``, also along ``_rows`` and ``_columns`` (None: unknown), and ``detail``; ``digest``
+    of the pixels; if large, share ``grey_rows`` of the rows that have one value, neither black nor white.
     """
     rows = image.shape[0]
     # (0.25, 0.5, 0.75): positions over the height of strips, which represent the image.
     first = sorted(
         {int(np.clip(share * rows - STRIP_ROWS / 2, 0, max(rows - STRIP_ROWS, 0))) for share in (0.25, 0.5, 0.75)}
     )
-    strips = np.array([_texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first])
-    shown = strips[np.isfinite(strips[:, 0])]
-    fine, coarse, (variance,) = np.split(shown.sum(axis=0), [len(ALONG), 2 * len(ALONG)])
-    known = bool(coarse.all())
+    textures = [texture(image[r : r + STRIP_ROWS], valid[r : r + STRIP_ROWS]) for r in first]
+    sharp = [s for s, _ in textures if all(map(math.isfinite, s))]
+    sharpness = [float(of) for of in np.median(sharp, axis=0)] if sharp else [None] * len(ALONG)
     # A quarter of the pixels is enough for mean and deviation.
     thinned = grey(np.ascontiguousarray(image[::2, ::2]))
     mask = ((valid[::2, ::2] != 0) & np.isfinite(thinned)).astype(np.uint8)
@@ -99,8 +98,8 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "deviation": float(deviation),
         "dark": float((usable <= MAX_DARK_GREY).mean()) if usable.size else 0.0,
         "bright": float((usable >= MIN_BRIGHT_GREY).mean()) if usable.size else 0.0,
-        **{what: math.sqrt(fine[k] / coarse[k]) if known else None for k, what in enumerate(ALONG)},
-        "detail": math.sqrt(coarse[0] / variance) if variance > 0 else 0.0,
+        **dict(zip(ALONG, sharpness, strict=True)),
+        "detail": float(np.median([d for _, d in textures])),
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
         **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
