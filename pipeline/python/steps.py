@@ -59,7 +59,8 @@ def match(left: Any, right: Any, **hfvm: Any) -> xarray.Dataset:
         Of each pixel of the left image (row, col): ``column_disparity`` and ``row_disparity``, right minus left,
         ``disparity_std``, standard deviation along the epipolar line, and ``backmatch_error``, float32 pixels, NaN
         undefined; ``distance``, float32, least feature distance; ``validity``, uint8. Gaps along rows are filled: of
-        ``validity`` the bit 1 is set where a pixel was matched, 2 where it was interpolated.
+        ``validity`` the bit 1 is set where a pixel was matched, 2 where it was interpolated. Attributes: ``usable``,
+        how many pixels show the scene and are not masked, and ``match_rate``, the matched share of these.
 
     Raises
     ------

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, huber_weight, mad_sigma
+from rille.stages.numeric.robust import TUKEY_BISQUARE, bisquare, cauchy, huber_weight, mad_sigma
 
 
 def test_the_spread_of_normal_errors_is_their_standard_deviation_and_outliers_hardly_move_it():
@@ -27,6 +27,13 @@ def test_the_bisquare_has_its_efficiency_where_errors_are_normal():
 def test_hubers_weight_bounds_the_residual():
     for r in (0.1, 1.0, 2.4, 2.6, 10.0):
         assert huber_weight(r, 2.5) * r == pytest.approx(min(r, 2.5))
+
+
+def test_cauchys_weight_is_that_of_its_logarithmic_cost():
+    """The weight is the derivative of ``spread^2 / 2 log(1 + (r / spread)^2)`` over the residual."""
+    r, spread = np.linspace(0.01, 20.0, 100_000), 2.5
+    cost = 0.5 * spread**2 * np.log1p((r / spread) ** 2)
+    np.testing.assert_allclose(cauchy(r, spread)[1:-1], (np.gradient(cost, r) / r)[1:-1], rtol=1e-3)
 
 
 def test_kernels_compile_the_same_numbers():
