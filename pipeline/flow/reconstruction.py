@@ -170,11 +170,13 @@ class Tracked:
 @dataclass(frozen=True)
 class Learnt:
     """What attempts have shown: frames that are ``refused`` or ``torn`` (None: not looked for yet), with the cause;
-    ``knocks`` of the rig, by pair; ``corrections`` of the calibration, of which the last one counts."""
+    ``knocks`` of the rig, by pair; ``shaken``: the segments that show knocks that no turn of the camera explains, so
+    that each pair has a rig of its own; ``corrections`` of the calibration, of which the last one counts."""
 
     refused: Mapping[int, str] = field(default_factory=dict)
     torn: dict[int, str] | None = None
     knocks: Mapping[int, ResectFacts] = field(default_factory=dict)
+    shaken: tuple[Handle[ResectFacts], ...] = ()
     corrections: tuple[list[float], ...] = ()
 
 
@@ -202,9 +204,11 @@ def attempted(
     p = make.products
     if learnt.corrections and p.crosscheck is not None:
         p.crosscheck = crosscheck_tasks(make, whole)
-    choice = yield from simultaneous(make, frames, whole, screening, {**learnt.refused, **(learnt.torn or {})})
+    mode = "per_pair" if learnt.shaken else make.config.rig.mode
+    choice = yield from simultaneous(make, frames, whole, screening, {**learnt.refused, **(learnt.torn or {})}, mode)
     if choice is None:
         return None
+    p.contradictions += learnt.shaken
     yield Complete(("swap_check", "keyframes", "synchrony", "rig", "calibration"))
     matched = yield from matched_pairs(make, after_knocks(make, choice.rigs, learnt.knocks))
     # Of most pairs a wrong rig is the cause, of few their images.
@@ -228,10 +232,14 @@ def attempted(
     if correction is not None and len(learnt.corrections) < MAX_CALIBRATIONS:
         # A wrong rig may look as if it was knocked.
         return replace(learnt, knocks={}, corrections=(*learnt.corrections, correction["corrected"]))
-    # Behind more than four knocks no frame has a pose.
-    first, followed = next(iter(moved), None), make.config.rig.mode != "fixed" and len(learnt.knocks) < 4
-    if correction is None and followed and first is not None and first not in learnt.knocks:
-        return replace(learnt, knocks={**learnt.knocks, first: moved[first]})
+    first = next(iter(moved), None)
+    if correction is None and first is not None and make.config.rig.mode != "fixed":
+        # More than four knocks, or one that rows show, are those of a rig that shakes.
+        if first not in learnt.knocks and len(learnt.knocks) < 4:
+            return replace(learnt, knocks={**learnt.knocks, first: moved[first]})
+        if mode == "pooled":
+            shaken = tuple(s.resection for s in segments if s.resection in p.contradictions)
+            return replace(learnt, knocks={}, shaken=shaken)
     if p.intrinsics is not None:
         p.contradictions.append(p.intrinsics)
     segments = refused_behind(make, matched, segments, moved)

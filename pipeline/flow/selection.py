@@ -97,15 +97,16 @@ class Choice:
 
 
 def simultaneous(
-    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str]
+    make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str], mode: str
 ) -> Generator[Wait, Any, Choice | None]:
-    """Choose basic pairs; leave out those whose rigs or images contradict the others, and choose again.
+    """Choose basic pairs with rigs by a ``mode``; leave out those whose rigs or images contradict the others, and choose
+    again.
 
     Frames are lost that the screening ``found``, that are ``odd`` (cause by frame), and whose left and right images do
     not fit each other though those of their neighbours do. If some pairs are of two times, all frames are screened
     again. None if the images of most pairs contradict the rig, or each other.
     """
-    p, mode, wrong = make.products, make.config.rig.mode, set[int]()
+    p, wrong = make.products, set[int]()
     row, timed = {frame: k for k, frame in enumerate(frames)}, False
     while True:
         chain = [f for f in found.meta["chain"] if f not in odd]

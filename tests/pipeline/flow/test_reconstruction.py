@@ -371,6 +371,17 @@ def test_what_a_knocked_rig_measures_is_worth_no_pose(back: bool, refused: list[
     ]
 
 
+def test_each_pair_of_a_rig_that_shakes_has_its_own() -> None:
+    """A knock that stays although it was followed: rows show it, which the turn along the lines does not change."""
+    knock = {"jump": [0.0, 1.4], "knocked": "the rig moved at pair 5"}
+    jumps = {"resect/3": knock, "resect/3/anew": knock}
+    _, products = lay_out([], WHOLE, CHOICE, POSED, jumps=jumps, cameras=[[0.0] * 4, [0.0] * 4])
+    assert len({id(handle) for handle in products.rigs.values()}) == 4
+    assert [h.spec.args.get("refused") for h in products.resections] == [None] * 4
+    assert products.contradictions[0].label == "resect/3/anew"
+    assert list(products.world_dem) == [0, 3, 5, 6]
+
+
 def test_from_a_knock_on_the_rig_that_it_left_is_used() -> None:
     knock = {"jump": [3.0, 0.0], "knocked": "the rig moved at pair 5"}
     _, products = lay_out([], WHOLE, CHOICE, POSED, jumps={"resect/3": knock}, cameras=[[0.0] * 4])
