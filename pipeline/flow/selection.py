@@ -99,8 +99,7 @@ class Choice:
 def simultaneous(
     make: Builder, frames: Series[int], whole: list[int], found: Ref[ScreeningFacts], odd: dict[int, str], mode: str
 ) -> Generator[Wait, Any, Choice | None]:
-    """Choose basic pairs with rigs by a ``mode``; leave out those whose rigs or images contradict the others, and choose
-    again.
+    """Choose basic pairs with rigs by ``mode``; leave out those whose rigs or images contradict the others, and repeat.
 
     Frames are lost that the screening ``found``, that are ``odd`` (cause by frame), and whose left and right images do
     not fit each other though those of their neighbours do. If some pairs are of two times, all frames are screened
