@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +17,7 @@ from rille.pipeline.export.view import RunView, by_frame, used_rig
 from rille.pipeline.flow.products import Stop
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import AnyArray, Bundle
+from rille.stages.core.quantities import count
 from rille.stages.geometry import rigid
 from rille.stages.geometry.epipolar import line_distances
 from rille.stages.geometry.lattice import Lattice, union
@@ -124,9 +126,21 @@ class Calibration:
         stated = self.facts[0].get(f"residual_{when}_px") if len(self.facts) == 1 else None
         return float(np.sqrt(np.mean(np.square(getattr(self, when))))) if stated is None else float(stated)
 
-    def collected(self, key: str) -> list[Any]:
-        """The entries of a list that each rig's facts have."""
-        return [entry for facts in self.facts for entry in facts.get(key) or ()]
+    @property
+    def parameters(self) -> list[Mapping[str, Any]]:
+        """The parameters of all rigs."""
+        return [parameter for facts in self.facts for parameter in facts.get("parameters") or ()]
+
+    def warnings(self) -> list[str]:
+        """Warnings of all rigs; of those that begin alike (up to a colon) at several rigs only the first."""
+        said: dict[tuple[str, int], list[str]] = {}
+        for facts in self.facts:
+            begun = Counter[str]()
+            for line in facts["warnings"]:
+                begun[lead := line.partition(":")[0]] += 1
+                said.setdefault((lead, begun[lead]), []).append(line)
+        alike = ((lines[0], len(lines) - lines.count(lines[0])) for lines in said.values())
+        return [f"{line} (and alike at {count(more, 'other pair')})" if more else line for line, more in alike]
 
 
 class Scene:

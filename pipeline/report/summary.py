@@ -101,7 +101,7 @@ def find_warnings(scene: Scene, figures: Mapping[str, Any]) -> list[str]:
     """List warnings, one line each: on the input, the rig, the choice of pairs, the comparison."""
     view, p, compared = scene.view, scene.view.products, scene.comparison
     lines = list(view.sequence.warnings)
-    lines += scene.calibration.collected("warnings") if scene.calibration is not None else []
+    lines += scene.calibration.warnings() if scene.calibration is not None else []
     early = [p.screening, *p.contradictions, p.keyframes, p.intrinsics, *p.crosschecks, p.crosscheck, p.agreement]
     truths = (p.accuracy, p.position_accuracy, *p.disparity_accuracy.values())
     for handle in (*early, p.trajectory, *truths, p.overlap_audit, *p.ground.values()):
@@ -337,7 +337,7 @@ def _rig(scene: Scene) -> dict[str, Any] | None:
     if calibration is None:
         return None
     facts = {key: calibration.facts[0].get(key) for key in ("source", "residual_before_px", "residual_after_px")}
-    parameters = calibration.collected("parameters")
+    parameters = calibration.parameters
     unsure = undecided(parameters, scene.view.config.rig.significance)
     counts = {"rigs": len(calibration.facts), "changed": calibration.changed}
     return counts | facts | {"parameters": parameters, "undecided": unsure}

@@ -183,7 +183,9 @@ def perform(
     last, outdated = opened.view.products.trajectory, opened.graph.outdated
     # What the trajectory lacked before it was adjusted, or driven to its end, is no matter.
     current = (h for h in opened.graph.nodes if h.stage != trajectory_stage.name or h is last)
-    valid = (h for h in current if h.index not in outdated)
+    # The report has those of the rigs, of which there may be one for each pair.
+    told = outdated | {rig.index for rig in opened.view.products.rigs.values()}
+    valid = (h for h in current if h.index not in told)
     suspicious = (line for h in valid if h.ref is not None for line in h.ref.meta.get("warnings", ()))
     for line in unsaid((*suspicious, *report["warnings"]), report["missing"], opened.view.sequence.warnings):
         warn(line)

@@ -319,7 +319,7 @@ def _drift(start: Sequence[Linear], per_pair: list[dict[str, Any]], params: RigP
             what = f"the rig moved at pair {change}: {name.replace('_', ' ')} by {degrees:.2f} degrees"
             warning = (
                 f"the rig moves: {name.replace('_', ' ')} of {int(odd.sum())} of {len(values)} pairs departs from the "
-                f"others', by {degrees:.2f} degrees, first at pair {change}; try rig.mode = per_pair"
+                f"others', by {degrees:.2f} degrees, first at pair {change}; by rig.mode = per_pair each has its own"
             )
             moves.append(_Move(what, warning, float(moved[odd].max())))
     return moves
