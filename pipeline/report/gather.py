@@ -136,7 +136,7 @@ class Calibration:
         said: dict[tuple[str, int], list[str]] = {}
         for facts in self.facts:
             begun = Counter[str]()
-            for line in facts["warnings"]:
+            for line in facts.get("warnings") or ():
                 begun[lead := line.partition(":")[0]] += 1
                 said.setdefault((lead, begun[lead]), []).append(line)
         alike = ((lines[0], len(lines) - lines.count(lines[0])) for lines in said.values())
