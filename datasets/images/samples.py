@@ -56,6 +56,7 @@ def examined(sequence: Sequence) -> Sequence:
         elif (share := fixed_pattern(of)) > 0.2:
             text = f"{share:.0%} of the finest detail of {camera} images keeps its place (fixed-pattern noise)"
             remedy = "subtract a dark frame, the mean of images that are taken with the lens covered"
+            remedy += "; if a projector casts dots, switch it off"
             lines.append(warning("RIL-833", f"{text}: {remedy}"))
         elif share := overlaid(of):
             text = f"{share:.0%} of the detail of {camera} images keeps its place all over the view, the rest moves"
