@@ -23,6 +23,7 @@ the calibration: a plane of ground that they tilt defines the world's vertical, 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import groupby, pairwise
@@ -247,7 +248,8 @@ VIEW_MOVES = "; the view moves by "
 
 
 def _lost(frames: Sequence[int], piece: NDArray[np.int16], causes: Mapping[int, str]) -> Iterator[str]:
-    """Lines on frames without a pose: one for those in a row that have one cause, but for how far each view moves."""
+    """Lines on frames without a pose: one for those in a row that have one cause, but for figures and how each view
+    moves."""
     posed, fates = np.flatnonzero(piece >= 0), list[tuple[int, str, str]]()
     for row in np.flatnonzero(piece < 0).tolist():
         behind = int(np.searchsorted(posed, row))
@@ -256,11 +258,13 @@ def _lost(frames: Sequence[int], piece: NDArray[np.int16], causes: Mapping[int, 
         bridged = len(sides) == 2 and piece[sides[0]] == piece[sides[1]]
         how = f"bridged from {frames[sides[0]]} to {frames[sides[1]]}" if bridged else "no pose"
         fates.append((row, causes.get(frames[row], "no frame beside it could be posed with it"), how))
-    keys = [(row - k, cause.partition(VIEW_MOVES)[0], how) for k, (row, cause, how) in enumerate(fates)]
-    for (_, cause, how), group in groupby(zip(keys, fates, strict=True), itemgetter(0)):
-        (_, (row, whole, _)), *others = group
+    alone = [cause.partition(VIEW_MOVES)[0] for _, cause, _ in fates]
+    keys = [(row - k, re.sub(r"[0-9.]+", "#", alone[k]), how) for k, (row, _, how) in enumerate(fates)]
+    for _, group in groupby(zip(keys, alone, fates, strict=True), itemgetter(0)):
+        (_, cause, (row, whole, how)), *others = group
         if others:
-            yield f"frames {frames[row]}-{frames[others[-1][1][0]]} lost: {cause}; {how}"
+            like = "" if all(other == cause for _, other, _ in others) else ", the first"
+            yield f"frames {frames[row]}-{frames[others[-1][2][0]]} lost{like}: {cause}; {how}"
         else:
             yield f"frame {frames[row]} lost: {whole}; {how}"
 

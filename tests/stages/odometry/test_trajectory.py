@@ -9,7 +9,7 @@ import pytest
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
 from rille.stages.geometry.geometry import RigidTransform, rotation_exp
 from rille.stages.odometry.doubtful_motion import doubtful_motion
-from rille.stages.odometry.resection.trajectory import ChainLink, chain, trajectory_stage
+from rille.stages.odometry.resection.trajectory import ChainLink, _lost, chain, trajectory_stage
 
 NONE = np.zeros((9, 6, 2))
 
@@ -124,6 +124,16 @@ def test_frames_lost_one_after_the_other_for_one_cause_are_one_line():
     assert list(out.meta["causes"]) == ["4", "5"]
     assert "from frame 4, 30% of it" in out.meta["causes"]["5"]
     assert out.meta["warnings"][0] == "frames 4-5 lost: too few landmarks; bridged from 3 to 6"
+
+
+def test_frames_lost_for_one_cause_with_other_figures_are_one_line_with_those_of_the_first():
+    frames, piece = range(10, 16), np.array([0, -1, -1, -1, -1, 0], np.int16)
+    causes = {11: "only 3 of 40 agree", 12: "only 4.5 of 7 agree", 13: "blurred", 14: "only 4.5 of 7 agree"}
+    assert [line.partition("; ")[0] for line in _lost(frames, piece, causes)] == [
+        "frames 11-12 lost, the first: only 3 of 40 agree",
+        "frame 13 lost: blurred",
+        "frame 14 lost: only 4.5 of 7 agree",
+    ]
 
 
 def test_a_frame_lost_within_a_segment_is_bridged():
