@@ -87,9 +87,10 @@ def judged(
     parts: list[Any] = []
     original = refinement.standard_deviation
 
-    def recording(noise: Any, disparity: Any, keep: Any) -> Any:
-        parts.extend(np.where(keep, p, np.nan) for p in (keep, noise, *refinement.neighbours(disparity, keep)))
-        return original(noise, disparity, keep)
+    def recording(noise: Any, likeness: Any, disparity: Any, keep: Any) -> Any:
+        found = refinement.parts(noise, likeness, disparity, keep)
+        parts.extend(np.where(keep, p, np.nan) for p in (keep, *found))
+        return original(noise, likeness, disparity, keep)
 
     refinement.standard_deviation = recording
     try:

@@ -186,7 +186,8 @@ class FinestWork:
 class Fine:
     """Result of the steps so far, (row, col): displacements to ``b``, float32 pixels; ``validity``, reasons to reject a
     pixel (:class:`~rille.stages.core.validity.Validity`); back-matching error, pixels; feature distance, -1 outside;
-    ``noise``, the variance of the column displacement (of the row's on upright lines) by noise, squared pixels."""
+    ``noise``, the variance of the column displacement (of the row's on upright lines) by noise, squared pixels;
+    ``likeness``, correlation of the residuals of neighbours."""
 
     u: AnyArray
     v: AnyArray
@@ -194,6 +195,7 @@ class Fine:
     error: AnyArray
     distance: AnyArray
     noise: AnyArray
+    likeness: AnyArray
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -213,7 +215,7 @@ def subpixel(work: FinestWork) -> Fine:
     u, v, distance = solver.sums(LevelPair(work.a.words, work.b.words), *work.left, everywhere)
     u, v = local_mean(u, v, np.ones(u.shape, bool), 2, 2)
     zeros = np.zeros(u.shape, np.float32)
-    return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros)
+    return Fine(u, v, np.zeros(u.shape, np.uint8), zeros, distance, zeros, zeros)
 
 
 def reasons(
@@ -250,7 +252,7 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     keep, work = fine.keep, work.alike
     # An image that a plane has aligned is sheared, and takes a step more.
     how = 1 if work.alignment is None else 2, work.upright
-    u, v, rest, per_noise = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
+    u, v, rest, per_noise, likeness = refinement.refine(work.compared(), work.to_right, (fine.u, fine.v), keep, *how)
     removed = work.images.left.noise**2, work.images.right.noise**2
     deviations = work.a.deviation, nearest(work.b.deviation, Map(u, v))
     alike, variance = refinement.surroundings(rest, deviations, keep, removed)
@@ -259,7 +261,7 @@ def refine(work: FinestWork, fine: Fine) -> Fine:
     hidden = (9.0 if any(removed) else 1.0) * (2.0 if any(work.blur) else 1.0)
     noise = per_noise * (variance * np.float32(hidden))
     validity = fine.against(keep & (alike < work.images.params.correlation), Validity.OVER_THRESHOLD)
-    return replace(fine, u=u, v=v, noise=noise, validity=validity)
+    return replace(fine, u=u, v=v, noise=noise, likeness=likeness, validity=validity)
 
 
 def smooth(work: FinestWork, fine: Fine) -> Fine:
@@ -342,7 +344,8 @@ def complete(
         # A filled pixel takes its neighbour's depth but its own epipolar line: on turned rigs rows change along a row.
         across[:] = epipolar.settled(epipolar.transposed(f) if ending.upright else f, along, across, done)
     matches &= ~alone
-    std = refinement.standard_deviation(results["noise"], v if ending.upright else u, keep & ~alone)
+    by_noise = results["noise"], results["likeness"]
+    std = refinement.standard_deviation(*by_noise, v if ending.upright else u, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
     filled[valid == 0] = 0

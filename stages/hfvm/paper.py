@@ -72,7 +72,7 @@ def match(left: Pyramid, right: Pyramid, params: HfvmParams, tell: Callable[[flo
     fine = [Map(*(whole + equalized(way.offset[..., i]) for i, whole in enumerate(way[:2]))) for way in ways]
     error, validity = reasons(fine[0], fine[1], ways[0].distance, (layers[0], layers[1]), params, planes[0][DEVIATION])
     arrays = {"u": fine[0].u, "v": fine[0].v, "validity": validity, "error": error, "distance": ways[0].distance}
-    arrays["noise"] = np.zeros_like(error)
+    arrays["noise"] = arrays["likeness"] = np.zeros_like(error)
     return complete(arrays, layers[0].valid, layers[0].window, params, Ending(left.shape))
 
 

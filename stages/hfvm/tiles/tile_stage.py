@@ -26,7 +26,7 @@ from rille.stages.hfvm.params import HfvmParams
 from rille.stages.hfvm.stage import OUTPUTS
 from rille.stages.imaging.pyramid import Pyramid
 
-FINE = ("u", "v", "validity", "error", "distance", "noise")
+FINE = ("u", "v", "validity", "error", "distance", "noise", "likeness")
 
 
 def opened(bundle: Bundle) -> Pyramid:
@@ -195,6 +195,7 @@ _PARTS = (
     _optional("distance", _GRID, "float32", "1", "least feature distance"),
     _optional("validity", _GRID, "uint8", "1", "bits that speak against a pixel"),
     _optional("noise", _GRID, "float32", "px", "variance by noise, squared pixels"),
+    _optional("likeness", _GRID, "float32", "1", "correlation of the residuals of neighbours"),
     _optional("region", _GRID, "int8", "1", "number of the textureless region, at half the resolution"),
 )
 _RESULTS = tuple(replace(a, optional=True) for a in OUTPUTS if a.name not in ("distance", "validity"))

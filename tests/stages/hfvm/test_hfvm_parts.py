@@ -173,6 +173,7 @@ def test_where_lines_run_along_the_columns_gaps_are_filled_as_along_the_rows(sig
     near, validity = rng.random(shape) < 0.3, np.where(rng.random(shape) < 0.4, Validity.BACKMATCH_FAILED, 0)
     u = np.where(near, sign * 9.0, 0.0).astype(np.float32)
     maps = {"u": u, "v": zeros(*shape), "error": zeros(*shape), "distance": zeros(*shape), "noise": zeros(*shape)}
+    maps["likeness"] = zeros(*shape)
     maps["validity"] = validity.astype(np.uint8)
     params, outer = HfvmParams(min_support=0.0), Window(0, shape[0], 0, shape[1])
     rows = complete(maps, np.ones(shape, np.uint8), outer, params, Ending(shape, sign, f=f))
@@ -269,7 +270,7 @@ class TestRefine:
         left, right, u, v = pair(lambda x, y: (-6.0 + 0.05 * y, 1.3 + 0.02 * x), noise=noise)
         start_u, start_v = (u + 0.3).astype(np.float32), (v - 0.3).astype(np.float32)
         keep = np.ones(u.shape, bool)
-        found_u, found_v, rest, _ = refined(left, right, (start_u, start_v), keep, 2)
+        found_u, found_v, rest, *_ = refined(left, right, (start_u, start_v), keep, 2)
         inner = np.s_[12:-12, 12:-12]
         gradient = np.sqrt(np.mean(np.gradient(right)[1] ** 2))
         # Least squares over the window: sqrt(2) noise / (gradient * window); the median of |error| is .67 of it, and
@@ -282,7 +283,7 @@ class TestRefine:
     def test_keeps_what_it_cannot_improve(self):
         left, right, *_ = pair(lambda x, y: (-6.0, 0.0))
         wrong = np.full(left.shape, 20.0, np.float32)
-        found_u, _, _, _ = refined(left, right, (wrong, wrong), np.zeros(left.shape, bool))
+        found_u, *_ = refined(left, right, (wrong, wrong), np.zeros(left.shape, bool))
         np.testing.assert_array_equal(found_u, wrong)
 
     def test_correlation_tells_noise_from_texture(self):
@@ -399,7 +400,7 @@ def test_patches_differ_in_what_shows_depth(upright):
     odd, even = np.zeros((60, 80), np.int16), np.zeros((60, 80), np.int16)
     odd[20:24, 30:36] = 9
     nothing = np.zeros(odd.shape, np.float32)
-    fine = Fine(nothing, nothing, np.zeros(odd.shape, np.uint8), nothing, nothing, nothing)
+    fine = Fine(nothing, nothing, np.zeros(odd.shape, np.uint8), nothing, nothing, nothing, nothing)
     image = as_matched(build(np.full(odd.shape, 90, np.uint8), PyramidParams()), HfvmParams())
     images, layer = PyramidPair(image, image, HfvmParams(), Recipe((), (), (0, 0))), image.layers[0]
     there = Map(even, odd) if upright else Map(odd, even)

@@ -1,5 +1,6 @@
 """Standard deviation of disparities: a hand-computed window, what it must follow, and that it holds against truth."""
 
+import cv2
 import numpy as np
 import pytest
 from matching_scenes import Texture, pair
@@ -9,7 +10,7 @@ from rille.stages.core.validity import matched
 from rille.stages.geometry.spline import coefficients
 from rille.stages.hfvm import refinement
 from rille.stages.hfvm.params import HfvmParams
-from rille.stages.hfvm.refinement import FLOOR_PX, neighbours, standard_deviation
+from rille.stages.hfvm.refinement import FLOOR_PX, _likeness, neighbours, standard_deviation
 from rille.stages.hfvm.stage import match
 
 
@@ -75,7 +76,8 @@ def test_in_pixels_of_the_right_image_whatever_its_scale():
         errors[scale] = np.quantile(np.abs(found.column_disparity - u)[ok], 0.68)
         claims[scale] = np.median(found.disparity_std[ok])
     for scale in (0.5, 2.0):
-        assert claims[scale] / claims[1.0] == pytest.approx(scale, rel=0.2)
+        # Noise of the smaller right image is interpolated, so neighbours err alike, and more than in proportion.
+        assert claims[scale] / claims[1.0] == pytest.approx(scale, rel=0.3 if scale < 1 else 0.2)
         assert errors[scale] < claims[scale]
 
 
@@ -88,7 +90,7 @@ def test_undefined_exactly_where_nothing_was_matched():
 
 def test_no_kept_pixel_gives_no_number_and_no_warning():
     image = np.zeros((6, 7), np.float32)
-    std = standard_deviation(image, image, np.zeros(image.shape, bool))
+    std = standard_deviation(image, image, image, np.zeros(image.shape, bool))
     assert np.isnan(std).all()
 
 
@@ -103,9 +105,34 @@ def test_edges_along_the_rows_leave_the_column_uncertain():
     found = []
     for image in (across := (128 + 60 * np.sin(x)).astype(np.float32), across.T.copy()):
         noise = 150.0 * per_noise(image, image)
-        found.append(standard_deviation(noise, flat, keep)[30, 30])
+        found.append(standard_deviation(noise, flat, flat, keep)[30, 30])
     up, along = found
     assert beyond_floor(along) > 5 * beyond_floor(up)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_residuals_of_neighbours_are_alike_where_noise_is_blurred_along_the_lines(upright):
+    rng, used = np.random.default_rng(4), np.ones((120, 160), np.float32)
+    white = rng.normal(0, 3, (120, 160)).astype(np.float32)
+    alike = (white + np.roll(white, 1, 0 if upright else 1)) / np.float32(np.sqrt(2))
+    across = (white + np.roll(white, 1, 1 if upright else 0)) / np.float32(np.sqrt(2))
+    inside = np.s_[20:-20, 20:-20]
+    for rest, least, most in ((white, -0.15, 0.03), (alike, 0.35, 0.5), (across, -0.15, 0.03)):
+        assert least < np.median(_likeness(rest, used, upright)[inside]) < most
+
+
+@pytest.mark.parametrize(("quality", "one", "two"), [(35, 0.56, 0.87), (60, 0.64, 0.94)])
+def test_stated_errors_nearly_hold_in_compressed_images(quality, one, two):
+    """JPEG leaves errors that are alike over some pixels; as if they were not, 0.49, 0.82 and 0.61, 0.92 are within."""
+    bumps = lambda x, y: (-9.0 + 2.0 * np.sin(x / 25) * np.sin(y / 20), 0.0)  # noqa: E731
+    left, right, u, _ = pair(bumps, (180, 240), seed=5, noise=1.0)
+    faint = (np.clip(np.rint(128 + 0.3 * (a - 128)), 0, 255).astype(np.uint8) for a in (left, right))
+    files = (cv2.imencode(".jpg", a, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for a in faint)
+    found = match(*(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files))
+    ok = matched(found.validity)
+    ratio = np.abs(found.column_disparity - u)[ok] / found.disparity_std[ok]
+    assert (ratio < 1).mean() > one
+    assert (ratio < 2).mean() > two
 
 
 def test_depth_edge_noise_and_weak_texture_are_less_certain():
