@@ -31,7 +31,7 @@ computed from figures of each pixel.
 
 The error of a disparity is taken as the sum of independent parts, so that variances add:
 
-    std^2 = floor^2 + (1 + likeness r)^2 (noise^2 N + relief^2 R + border^2 M)
+    std^2 = floor^2 + (1 + 4 r)^2 (noise^2 N + relief^2 R + border^2 M)
 
 N: variance of the least-squares displacement of the 5 x 5 window (the Cramer-Rao bound: residual variance after
 refinement, times the element of the inverse structure tensor for the column, or the row). A window along a column edge
@@ -39,9 +39,10 @@ has a small one, a window along a row edge a large one. R: mean square, in the 5
 lies from the mean of the four two pixels away (0 on a plane); errors of neighbours differ, and a window on relief or a
 depth edge mixes the surfaces in it. M: share of unmatched pixels in 9 x 9; beside occlusions and failed matches a match
 is often drawn to the wrong surface. r: correlation of the residual of a pixel with that of the next one along the
-lines, in 31 x 31; 0 if negative. Camera noise has 0; what JPEG, a camera's own denoising, or that of strong noise here
-leaves, up to .5: a window averages fewer errors if these are alike, and neighbours err alike. The floor stands for
-errors that no pixel shows: sampling, lenses, the matcher's own sub-pixel bias.
+lines, in 31 x 31, as far as it exceeds .25. Camera noise has 0, fine grain that both images sample otherwise .25; what
+JPEG, a camera's own denoising, or that of strong noise here leaves, up to .5: a window averages fewer errors if these
+are alike, and neighbours err alike. The floor stands for errors that no pixel shows: sampling, lenses, the matcher's
+own sub-pixel bias.
 
 Of the pixels with similar N, R, M and r, 68 % err by less than one standard deviation and 95 % by less than two. So the
 standard deviation is no root mean square: a few mismatches (a repeated pattern, a hidden pixel that resembles another)
@@ -432,8 +433,8 @@ def parts(
     noise: AnyArray, likeness: AnyArray, disparity: AnyArray, keep: NDArray[np.bool_]
 ) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Parts N, R and M of :func:`standard_deviation`, each as much larger as errors of neighbours are alike."""
-    # 1.7: chosen with a rendered pair with noise, blurred noise, and JPEG of qualities 25 to 95.
-    more = (np.float32(1) + np.float32(1.7) * np.maximum(likeness, np.float32(0))) ** 2
+    # Chosen with the pairs for choosing, and a rendered one with noise, blurred noise, and JPEG of qualities 35 to 95.
+    more = (np.float32(1) + np.float32(4.0) * np.maximum(likeness - np.float32(0.25), np.float32(0))) ** 2
     relief, border = neighbours(disparity, keep)
     return noise * more, relief * more, border * more
 

@@ -76,8 +76,7 @@ def test_in_pixels_of_the_right_image_whatever_its_scale():
         errors[scale] = np.quantile(np.abs(found.column_disparity - u)[ok], 0.68)
         claims[scale] = np.median(found.disparity_std[ok])
     for scale in (0.5, 2.0):
-        # Noise of the smaller right image is interpolated, so neighbours err alike, and more than in proportion.
-        assert claims[scale] / claims[1.0] == pytest.approx(scale, rel=0.3 if scale < 1 else 0.2)
+        assert claims[scale] / claims[1.0] == pytest.approx(scale, rel=0.2)
         assert errors[scale] < claims[scale]
 
 
@@ -121,18 +120,18 @@ def test_residuals_of_neighbours_are_alike_where_noise_is_blurred_along_the_line
         assert least < np.median(_likeness(rest, used, upright)[inside]) < most
 
 
-@pytest.mark.parametrize(("quality", "one", "two"), [(35, 0.56, 0.87), (60, 0.64, 0.94)])
-def test_stated_errors_nearly_hold_in_compressed_images(quality, one, two):
-    """JPEG leaves errors that are alike over some pixels; as if they were not, 0.49, 0.82 and 0.61, 0.92 are within."""
+@pytest.mark.parametrize("sigma", [8.0, 12.0])
+def test_stated_errors_hold_where_noise_is_alike_in_neighbours(sigma):
+    """As a camera's own denoising leaves it, or the compression of images."""
     bumps = lambda x, y: (-9.0 + 2.0 * np.sin(x / 25) * np.sin(y / 20), 0.0)  # noqa: E731
-    left, right, u, _ = pair(bumps, (180, 240), seed=5, noise=1.0)
-    faint = (np.clip(np.rint(128 + 0.3 * (a - 128)), 0, 255).astype(np.uint8) for a in (left, right))
-    files = (cv2.imencode(".jpg", a, [cv2.IMWRITE_JPEG_QUALITY, quality])[1] for a in faint)
-    found = match(*(cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files))
+    left, right, u, _ = pair(bumps, (180, 240), seed=5)
+    rng = np.random.default_rng(6)
+    faint = (128 + 0.3 * (a - 128) + cv2.GaussianBlur(rng.normal(0, sigma, a.shape), None, 1.0) for a in (left, right))
+    found = match(*faint)
     ok = matched(found.validity)
     ratio = np.abs(found.column_disparity - u)[ok] / found.disparity_std[ok]
-    assert (ratio < 1).mean() > one
-    assert (ratio < 2).mean() > two
+    assert 0.62 < (ratio < 1).mean() < 0.9
+    assert (ratio < 2).mean() > 0.9
 
 
 def test_depth_edge_noise_and_weak_texture_are_less_certain():
