@@ -62,6 +62,11 @@ class Handle(Generic[F]):
         """Whether there is an artifact."""
         return self.ref is not None
 
+    @property
+    def lost(self) -> bool:
+        """Whether there will never be an artifact."""
+        return self.status in ("failed", "skipped")
+
     def upstream(self) -> list[Handle]:
         """Handles of all inputs, in order of the ports."""
         return flatten_ports(self.inputs)

@@ -362,8 +362,7 @@ def _kind(distribution: str) -> str:
 
 def _blas(package: str) -> str:
     """Core type that the OpenBLAS of a package has chosen; empty where it brings none."""
-    spec = importlib.util.find_spec(package)
-    for root in map(Path, (spec and spec.submodule_search_locations) or ()):
+    for root in _roots(package):
         for path in (*root.parent.glob(f"{package}.libs/*openblas*"), *root.glob(".dylibs/*openblas*")):
             # Asked of the library itself: the choice depends on the processor and OPENBLAS_CORETYPE, and no package
             # tells it.

@@ -427,7 +427,7 @@ class _Run:
         if self.stopped or self.suspects:
             return False
         for i, waiting in enumerate(self.graph.waiting):
-            known = all(h.done or h.earlier or h.status in ("failed", "skipped") for h in waiting.handles)
+            known = all(h.done or h.earlier or h.lost for h in waiting.handles)
             if waiting.go_on is not None and known:
                 del self.graph.waiting[i]
                 self._expand(waiting.handles, waiting.go_on)
@@ -470,7 +470,7 @@ class _Run:
                 else:
                     handle.reason = self.stopped
                     self._resolve(handle, "skipped")
-        gone = {h for h in self.graph.nodes if h.index in self.graph.outdated and h.status in ("failed", "skipped")}
+        gone = {h for h in self.graph.nodes if h.index in self.graph.outdated and h.lost}
         self.graph.nodes[:] = [h for h in self.graph.nodes if h not in gone]
         self.result.failures = [f for f in self.result.failures if f.label not in {h.label for h in gone}]
         for waiting in self.graph.waiting:

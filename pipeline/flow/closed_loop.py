@@ -450,7 +450,7 @@ class Drive(Builder):
     def _assess(self) -> Generator[Wait, Any, None]:
         """Compare the drive with the truth; nothing else compares them."""
         p = self.products
-        if not self.pairs or p.trajectory is None or _failed(self.pairs[0].level) or _failed(p.trajectory):
+        if not self.pairs or p.trajectory is None or self.pairs[0].level.lost or p.trajectory.lost:
             p.trajectory = None  # it failed at its first stop
             self._check({})
             return
@@ -475,7 +475,7 @@ class Drive(Builder):
     def _check(self, known: dict[str, Any]) -> None:
         """Compare the driven legs with the truth."""
         d = self.driven
-        legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not _failed(s.drive)]
+        legs = [(s.row, s.drive) for s in d.stops if s.drive is not None and not s.drive.lost]
         assert d.place is not None
         d.check = self.node(
             drive_check_stage,
@@ -501,11 +501,6 @@ class Drive(Builder):
         truth = tuple(RigidTransform.from_matrix(self.true[f]) if f in self.true else None for f in range(n))
         names = tuple(f"{f:06d}" for f in range(n))
         return replace(self.sequence, frames=n, frame_names=names, truth=truth), tuple(self.posed)
-
-
-def _failed(handle: Handle) -> bool:
-    """Whether a task will never have an artifact."""
-    return handle.status in ("failed", "skipped")
 
 
 def dataflow(graph: Graph, sequence: Sequence, config: Any, frames: tuple[int, ...]) -> tuple[Products, Drive | None]:

@@ -20,7 +20,7 @@ from rille.stages.core.declare import AnyArray, Bundle
 from rille.stages.core.quantities import count
 from rille.stages.geometry import rigid
 from rille.stages.geometry.epipolar import line_distances
-from rille.stages.geometry.lattice import Lattice, union
+from rille.stages.geometry.lattice import Lattice
 from rille.stages.odometry.resection.trajectory import world_poses
 
 
@@ -156,8 +156,8 @@ class Scene:
         if not tiles:
             return None
         names = "elevation", "elevation_std", "spread", "count", "source", "ortho"
-        lattice = union(Lattice.from_dict(tile.meta["lattice"]) for tile in tiles)
-        return WorldTerrain(lattice, {name: whole(tiles, name)[1] for name in names})
+        merged = {name: whole(tiles, name) for name in names}
+        return WorldTerrain(merged["elevation"][0], {name: values for name, (_, values) in merged.items()})
 
     @cached_property
     def risk(self) -> WorldTerrain | None:

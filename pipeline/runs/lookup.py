@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -128,12 +128,11 @@ def used(run: Path) -> set[str]:
 
 def shared_images(runs: Iterable[Path]) -> Iterator[str]:
     """Lines on runs that have images in common, as two of one sequence: what these show would count twice."""
-    images = {run: {row["digest"] for label, row in tasks(run).items() if _is_left_image(label, row)} for run in runs}
+    images = {
+        run: {row.get("digest") for label, row in tasks(run).items() if label.startswith("image/left/")} - {None}
+        for run in runs
+    }
     for (a, ours), (b, theirs) in combinations(images.items(), 2):
         if both := len(ours & theirs):
             text = f"{count(both, 'left image')} of {name(b)} are those of {name(a)}, and count twice"
             yield warning("RIL-848", f"{text}: stated standard deviations are too small")
-
-
-def _is_left_image(label: str, row: Mapping[str, Any]) -> bool:
-    return label.startswith("image/left/") and "digest" in row

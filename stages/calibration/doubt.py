@@ -104,7 +104,7 @@ def repeated(left: AnyArray, right: AnyArray, places: Places, f: NDArray[np.floa
     """
     a, b = (np.ascontiguousarray(image, np.float32) for image in (left, right))
     b, places, f = _as_left(b, places, f)
-    keep = _inside(places[0], a.shape, PATCH_RADIUS_PX) & _inside(places[1], b.shape, PATCH_RADIUS_PX)
+    keep = _holds_patch(a.shape, places[0]) & _holds_patch(b.shape, places[1])
     chosen = np.flatnonzero(keep)
     chosen = chosen[:: -(-len(chosen) // 150) or 1]
     looks_alike = []
@@ -172,9 +172,10 @@ def _as_left(
     return right, (places[0], places[1] @ back.T + shift), None if f is None else np.linalg.inv(whole).T @ f
 
 
-def _inside(places: AnyArray, shape: tuple[int, ...], margin: int) -> NDArray[np.bool_]:
-    last = np.array([shape[1] - 1 - margin, shape[0] - 1 - margin])
-    return np.asarray(((np.rint(places) >= margin) & (np.rint(places) <= last)).all(axis=1))
+def _holds_patch(shape: tuple[int, ...], places: AnyArray) -> NDArray[np.bool_]:
+    """Whether an image holds the whole patch around each place (n, 2), column and row."""
+    last = np.array(shape[1::-1]) - 1 - PATCH_RADIUS_PX
+    return np.asarray(((np.rint(places) >= PATCH_RADIUS_PX) & (np.rint(places) <= last)).all(axis=1))
 
 
 def doubts(result: Any, left: NDArray[Any], right: NDArray[Any], *, closely: bool = True) -> Iterator[str]:

@@ -10,13 +10,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from rille.stages.calibration.parameter_selection import Parameter, RelativeParams, decide
-from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, adjust, solution
+from rille.stages.calibration.relative_orientation import MIN_MATCHES, PointPairs, estimate
 from rille.stages.core.arrays import Floats
 from rille.stages.core.errors import InputError, warning
-from rille.stages.geometry.epipolar import NAMES, corrected
+from rille.stages.geometry.epipolar import corrected
 from rille.stages.geometry.geometry import Rig
 
 
@@ -56,12 +54,7 @@ def joint(given: Rig, matches: Mapping[str, Sequence[PointPairs]], params: Relat
         raise InputError("RIL-030", text, remedy="leave it out, or choose more frames")
     decision = decide(given, [pair for pairs in matches.values() for pair in pairs], params)
     observed, priors = [p.observed for p in decision.parameters], params.priors(given)
-    estimates = []
-    for name, pairs in matches.items():
-        values, covariance, _ = solution(
-            adjust(given, pairs, observed, priors, rival=False), observed, priors, rival=False
-        )
-        estimates.append(Estimate(name, values[: len(NAMES)], np.sqrt(np.diag(covariance))[: len(NAMES)]))
+    estimates = (Estimate(name, *estimate(given, pairs, observed, priors)) for name, pairs in matches.items())
     return Joint(corrected(given, decision.correction), decision.parameters, tuple(estimates))
 
 

@@ -136,10 +136,6 @@ class Decision:
         """Whether anything departs from the calibration."""
         return bool(np.any(self.correction))
 
-    def free(self) -> list[bool]:
-        """Which parameters were freed."""
-        return [p.freed for p in self.parameters]
-
 
 def decide(rig: Rig, pairs: Sequence[PointPairs], params: RelativeParams) -> Decision:
     """Which parameters of a rig the pairs change, and by how much."""

@@ -212,6 +212,12 @@ def solution(fit: OrientationFit, free: Sequence[bool], priors: Priors, *, rival
     return x, covariance, 0.5 * float(np.sum(fit.pull * x))
 
 
+def estimate(rig: Rig, pairs: Sequence[PointPairs], free: Sequence[bool], priors: Priors) -> tuple[Floats, Floats]:
+    """Values and standard deviations (5,), radians, of the corrections of a rig by some pairs, cameras as given."""
+    x, covariance, _ = solution(adjust(rig, pairs, free, priors, rival=False), free, priors, rival=False)
+    return x[:RIG], np.sqrt(np.diag(covariance))[:RIG]
+
+
 @dataclass(frozen=True)
 class _Part:
     normal: Floats

@@ -31,10 +31,9 @@ from rille.stages.calibration.relative_orientation import (
     MIN_MATCHES_OF_BLOCK,
     Linear,
     PointPairs,
-    adjust,
+    estimate,
     linearised,
     rms,
-    solution,
 )
 from rille.stages.core.arrays import Floats
 from rille.stages.core.declare import Bundle, stage
@@ -196,12 +195,10 @@ def _alone(given: Rig, matches: PointPairs, decision: Decision, params: RigParam
     """One pair's own values and sigmas, degrees, of all parameters that the sequence observes."""
     names = [p.name for p in decision.parameters if p.observed]
     free = [p.observed for p in decision.parameters]
-    priors = params.priors(given)
-    fit = adjust(given, [matches], free, priors, rival=False)
-    sigma = np.sqrt(np.diag(solution(fit, free, priors, rival=False)[1]))
+    values, sigma = estimate(given, [matches], free, params.priors(given))
     return {
         "pair": matches.pair,
-        "values": {n: math.degrees(fit.x[NAMES.index(n)]) for n in names},
+        "values": {n: math.degrees(values[NAMES.index(n)]) for n in names},
         "sigma": {n: math.degrees(sigma[NAMES.index(n)]) for n in names},
     }
 

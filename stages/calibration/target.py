@@ -142,11 +142,8 @@ def refuse_one_place(rig: RigCalibration) -> None:
 
 def _enough(views: Sequence[BoardView]) -> None:
     if len(views) < LEAST_VIEWS:
-        raise DegenerateError(
-            "RIL-309",
-            f"{len(views)} views of the board are too few to calibrate with",
-            remedy=MORE_VIEWS,
-        )
+        text = f"{len(views)} views of the board are too few to calibrate with"
+        raise DegenerateError("RIL-309", text, remedy=MORE_VIEWS)
 
 
 def _undetermined() -> DegenerateError:

@@ -113,23 +113,23 @@ def measure(a: DemFile, b: DemFile, align: str = "none") -> tuple[dict[str, Any]
 
     Errors are those of :func:`rille.stages.evaluation.dem_comparison.assess`.
     """
-    cameras, unit = (
-        a.viewpoints if a.viewpoints is not None else b.viewpoints,
-        "m, from the nearest position of the left camera",
-    )
+    cameras = a.viewpoints if a.viewpoints is not None else b.viewpoints
+    unit = "m, from the nearest position of the left camera"
     if cameras is None and crs_name(ENGINEERING_CRS) in (crs_name(a.crs), crs_name(b.crs)):
         cameras, unit = np.zeros((1, 2)), "m, from the frame's origin (the first left camera)"
     unit = "no camera is known: give the folder of a run for A or B" if cameras is None or not len(cameras) else unit
     found, error, cells = assess(a.grid, b.grid, None if align == "none" else align, cameras)  # type: ignore[arg-type]
     missing_crs = [warning("RIL-694", f"{r.name} states no CRS: taken as the other's") for r in (a, b) if not r.crs]
-    bins = {"by_slope": ("degrees of B", found.pop("by_slope")), "by_range": (unit, found.pop("by_range"))}
+    binned = {
+        name: {"unit": of, "bins": found[name]} for name, of in (("by_slope", "degrees of B"), ("by_range", unit))
+    }
     figures = {
         "a": _about(a),
         "b": _about(b),
         "error": "A minus B, m",
         "warnings": [*missing_crs, *a.warnings, *b.warnings],
         **found,
-        **{name: {"unit": words, "bins": each} for name, (words, each) in bins.items()},
+        **binned,
     }
     return figures, error, cells
 
