@@ -105,18 +105,19 @@ INTERVAL = 5.0
 """Seconds between plain lines."""
 
 
-def make(mode: str = "auto", stream: TextIO | None = None) -> Progress:
-    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``."""
+def make(mode: str = "auto", stream: TextIO | None = None, name: str = "") -> Progress:
+    """``auto`` (bar on a terminal, else plain), ``bar``, ``plain``, ``quiet``; ``name``: whose progress it is."""
     if mode == "auto":
         mode = "bar" if (stream or sys.stderr).isatty() else "plain"
-    return {"bar": Bar, "plain": Lines, "quiet": Progress}[mode](stream)
+    return {"bar": Bar, "plain": Lines, "quiet": Progress}[mode](stream, name)
 
 
 class Progress:
     """Receives the run's progress: counts the tasks that have ended, and says nothing."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self.stream = stream or sys.stderr
+    def __init__(self, stream: TextIO | None = None, name: str = "") -> None:
+        # Lines of several runs, one after another or in threads, stand in one stream.
+        self.stream, self.of = stream or sys.stderr, f"{name}: " if name else ""
         self.done, self.shown = 0, time.monotonic()
 
     def open(self) -> None:
@@ -153,18 +154,18 @@ class Lines(Progress):
         self._say(f"{label} failed ({type(error).__name__})")
 
     def _say(self, text: str) -> None:
-        print(f"rille: {text}", file=self.stream, flush=True)
+        print(f"rille: {self.of}{text}", file=self.stream, flush=True)
 
 
 class Bar(Lines):
     """A bar of the tasks that have ended."""
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self, stream: TextIO | None = None, name: str = "") -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
-        super().__init__(stream)
+        super().__init__(stream, name)
         columns = MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         named = TextColumn("{task.description}", markup=False)
         self.rich = RichProgress(*columns, named, console=Console(file=raw(self.stream)), transient=True)
@@ -175,11 +176,11 @@ class Bar(Lines):
         self.rich.start()
 
     def _show(self, handle: Handle, total: int) -> None:
-        self.rich.update(self.task, completed=self.done, total=total, description=plain(handle.label))
+        self.rich.update(self.task, completed=self.done, total=total, description=plain(f"{self.of}{handle.label}"))
 
     def close(self) -> None:
         """Take the bar away."""
         self.rich.stop()
 
     def _say(self, text: str) -> None:
-        self.rich.console.print(f"rille: {plain(text)}", markup=False, highlight=False, soft_wrap=True)
+        self.rich.console.print(f"rille: {plain(self.of + text)}", markup=False, highlight=False, soft_wrap=True)

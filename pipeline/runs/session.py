@@ -272,7 +272,7 @@ def _compute(opened: _Opened, kept: list[Workers] | None) -> driver.Result:
             keep_going=options.keep_going,
             force=options.force,
             ledger=opened.folder / LEDGER,
-            progress=events.make("quiet" if options.quiet else options.progress),
+            progress=events.make("quiet" if options.quiet else options.progress, name=view.sequence.name),
             memory_limit=memory_limit(options),
             kept=kept,
         ),

@@ -450,12 +450,12 @@ def test_a_ledger_that_cannot_be_written_is_named_and_the_bar_goes(cache):
 def test_progress_speaks_on_its_stream_alone(cache, mode, capsys, monkeypatch):
     monkeypatch.setattr(events, "INTERVAL", 0.0)
     stream = io.StringIO()
-    run(cache, make=mischief("fine", "value"), progress=events.make(mode, stream))
+    run(cache, make=mischief("fine", "value"), progress=events.make(mode, stream, "street"))
     text = stream.getvalue()
     if mode == "quiet":
         assert text == ""
     else:
-        assert "value failed (ValueError)" in text
+        assert "rille: street: value failed (ValueError)" in text, "several runs may write to one stream"
     assert capsys.readouterr() == ("", "")
 
 
