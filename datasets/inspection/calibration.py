@@ -12,8 +12,9 @@ import numpy as np
 from rille.datasets.cameras import KNOWN, CalibratedCamera, read_cameras
 from rille.datasets.cameras.model import of_size, relative_pose
 from rille.datasets.images.kinds import line
+from rille.datasets.inspection.patterns import relative
 from rille.datasets.inspection.tables import TABLES
-from rille.datasets.inspection.views import FoundImages, relative
+from rille.datasets.inspection.views import FoundImages
 from rille.datasets.text.sides import two_sides
 from rille.stages.core.errors import RilleError
 from rille.stages.geometry.geometry import RigidTransform, Sizes

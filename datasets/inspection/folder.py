@@ -17,8 +17,9 @@ from rille.datasets.images.files import SUFFIXES
 from rille.datasets.images.headers import located
 from rille.datasets.images.kinds import hints, line, unread
 from rille.datasets.inspection.calibration import CALIBRATIONS, FoundCalibration, find_calibration
+from rille.datasets.inspection.patterns import relative
 from rille.datasets.inspection.tables import CAMERA_WORDS, TABLES, table_kind
-from rille.datasets.inspection.views import COMPUTED, DEPTH, FoundImages, find_views, relative
+from rille.datasets.inspection.views import COMPUTED, DEPTH, FoundImages, find_views
 from rille.datasets.manifest.model import VEHICLE_FILE, stated_vehicle
 from rille.datasets.protocol import CAMERAS
 from rille.datasets.text.names import UNWRITABLE, shell_word, writable

@@ -1,15 +1,14 @@
 """Quality of one stereo pair before matching: grey values, sharpness, and digests that show repeated images.
 
-These figures distinguish a black, blurred or repeated image from a good one. The decision is made over the whole
-sequence (:mod:`rille.stages.odometry.frame_screening`).
+These figures distinguish a black, blurred or repeated image from a good one (:mod:`rille.stages.imaging.image_faults`).
+The decision is made over the whole sequence (:mod:`rille.stages.odometry.frame_screening`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,16 +25,8 @@ MAX_DARK_GREY, MIN_BRIGHT_GREY = 2.0, 253.0
 MAX_GREY_ROWS = 0.1
 """Share of the rows of an image with one grey value, beyond those of the other image, that is no chance."""
 
-MIN_NOISE_SHARPNESS, MIN_NOISE_DETAIL = 4.3, 0.18
-"""Of uncorrelated noise alone, whose sharpness is 4.6 and whose detail is 0.19 (:func:`texture`); photographs have a
-sharpness of about 1, or, with strong noise, a smaller detail: their grey values deviate by more than the noise."""
-
 STRIP_ROWS = 32
 """Rows of a strip: some ten thousand pixels, and three times the reach of the wider blur."""
-
-
-AROUND = 8
-"""Images before and after one with which its sharpness is compared: more than a shake or a drop of rain blurs."""
 
 ALONG = {"sharpness": (1, 1), "sharpness_rows": (1, 0), "sharpness_columns": (0, 1)}
 """Directions (column, row) in which sharpness is measured: motion blurs an image along one of them alone."""
@@ -103,77 +94,6 @@ def glance(image: NDArray[Any], valid: Bytes) -> dict[str, Any]:
         "digest": hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest(),
         **({"grey_rows": one} if one > MAX_GREY_ROWS else {}),
     }
-
-
-class Blur(NamedTuple):
-    """Share of the usual sharpness that an image has, detail counted twice: 1 usual; and the figure in words."""
-
-    share: float
-    words: str
-
-
-def blurs(looks: Sequence[Mapping[str, Any]]) -> list[Blur]:
-    """How blurred the images of a camera are, in their order; ``looks``: figures of :func:`glance`.
-
-    Usual is the median of the images around: what a camera sees changes, and with it the figures.
-    """
-    out = []
-    for k, seen in enumerate(looks):
-        near = looks[max(k - AROUND, 0) : k + AROUND + 1]
-        # Noise is sharper than any photograph.
-        shown = [one for one in near if not drowned(one)]
-        worst = Blur(math.inf, "")
-        for what, times in (*dict.fromkeys(ALONG, 1).items(), ("detail", 2)):
-            known = [one[what] for one in shown if one[what] is not None]
-            usual = float(np.median(known)) if len(known) > 2 else 0.0
-            share = seen[what] / usual if seen[what] is not None and usual > 0 else 1.0
-            words = f"{share:.0%} of the usual {what.replace('_', ' along the ')}"
-            worst = min(worst, Blur(times * share, words), key=lambda blur: blur.share)
-        out.append(worst)
-    return out
-
-
-def drowned(seen: Mapping[str, Any]) -> bool:
-    """Whether all fine detail of an image is uncorrelated noise; ``seen``: by :func:`glance`."""
-    return seen["sharpness"] is not None and seen["sharpness"] > MIN_NOISE_SHARPNESS
-
-
-def noise_alone(seen: Mapping[str, Any]) -> bool:
-    """Whether an image shows uncorrelated noise and nothing else, as behind a lens cap; ``seen``: by :func:`glance`."""
-    return drowned(seen) and seen["detail"] > MIN_NOISE_DETAIL
-
-
-def grey_rows(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """Warnings about cameras whose images have rows of one grey value that the other's of the same frames do not have.
-
-    ``sides``: figures of :func:`glance` of the left and of the right images. A sky of one value is in both.
-    """
-    lines = []
-    shares = {side: np.array([seen.get("grey_rows", 0.0) for seen in looks]) for side, looks in sides.items()}
-    for side, other in (("left", "right"), ("right", "left")):
-        odd = shares[side] - shares[other] > MAX_GREY_ROWS
-        if odd.any():
-            which = f"{int(odd.sum())} of {len(odd)} {side} images"
-            rows = f"show one grey value in {shares[side][odd].mean():.0%} of their rows"
-            lines.append(
-                f"{which} {rows}, the {other} ones do not: nothing is measured there; did sensor or transmission fail?"
-            )
-    return lines
-
-
-def faint(sides: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """Warnings about cameras most of whose images are nearly uniform; ``sides``: as of :func:`grey_rows`."""
-    lines = []
-    for side, looks in sides.items():
-        deviation = float(np.median([seen["deviation"] for seen in looks])) if looks else math.inf
-        # 2.5: of 255, below which noise and rounding hide landmarks: rendered ground with noise of 0.8 gave all poses
-        # down to 2.8, and none from 2.4 on.
-        if deviation < 2.5:
-            lines.append(
-                f"the {side} images are faint: their grey values deviate by {deviation:.1f} of 255 (median), so that "
-                "landmarks drown in noise: give more light, a longer exposure or images of more bits"
-            )
-    return lines
 
 
 @stage("image_quality")

@@ -28,15 +28,8 @@ from rille.stages.core.errors import DegenerateError
 from rille.stages.facts.calibration import SwapFacts
 from rille.stages.facts.imaging import QualityFacts
 from rille.stages.facts.odometry import MotionFacts, ScreeningFacts, StepTableFacts
-from rille.stages.imaging.image_quality import (
-    MAX_DARK_GREY,
-    MIN_BRIGHT_GREY,
-    blurs,
-    drowned,
-    faint,
-    grey_rows,
-    noise_alone,
-)
+from rille.stages.imaging.image_faults import blurs, drowned, faint, grey_rows, noise_alone
+from rille.stages.imaging.image_quality import MAX_DARK_GREY, MIN_BRIGHT_GREY
 from rille.stages.odometry.steps import MIN_MATCHES, Step, steps_of
 
 Steps = Mapping[tuple[int, int], float]

@@ -13,8 +13,9 @@ from raising import raises
 
 from rille.datasets.images.files import Digests
 from rille.datasets.inspection.folder import inspect
+from rille.datasets.inspection.patterns import pattern
 from rille.datasets.inspection.tables import table_kind
-from rille.datasets.inspection.views import find_views, pattern
+from rille.datasets.inspection.views import find_views
 from rille.datasets.manifest.model import read_manifest
 from rille.datasets.manifest.opening import find_pairs, open_manifest
 from rille.datasets.manifest.text import manifest_text, needs

@@ -12,7 +12,7 @@ import numpy as np
 
 from rille.pipeline.runs.checks.limits import Finding, judge
 from rille.stages.core.arrays import Floats
-from rille.stages.imaging.image_quality import blurs, faint, grey_rows
+from rille.stages.imaging.image_faults import blurs, faint, grey_rows
 from rille.stages.odometry.frame_screening import FrameScreeningParams
 
 Look = Mapping[str, Any]

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from rille.stages.core.declare import Bundle, NoParams, check_outputs
-from rille.stages.imaging.image_quality import glance, image_quality_stage, noise_alone
+from rille.stages.imaging.image_faults import noise_alone
+from rille.stages.imaging.image_quality import glance, image_quality_stage
 
 
 def picture(seed=1, shape=(200, 300), blur=1.2):
