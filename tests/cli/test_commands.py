@@ -154,7 +154,9 @@ def test_what_is_no_crate_of_a_run_is_refused(place: Place, tmp_path: Path, cont
 def test_reconstruct_says_how_it_goes(place: Place) -> None:
     plain = place.said["mockup"].err.splitlines()
     told = [line for line in plain if not line.startswith("rille: note: ")]
-    assert all(re.fullmatch(r"rille: mockup-short: (\d+/\d+ tasks, .*|\S+: compiling, once: \d+ s)", line) for line in told)
+    assert all(
+        re.fullmatch(r"rille: mockup-short: (\d+/\d+ tasks, .*|\S+: compiling, once: \d+ s)", line) for line in told
+    )
     assert all(line.startswith("rille: ") for line in plain)
 
 
