@@ -194,8 +194,11 @@ class _Chooser:
         return [i for i in chosen if abs(correction[i]) >= LEAST_SIGMAS * self._sigma(i, chosen, fit)]
 
     def _enough(self, chosen: list[int], fit: OrientationFit, correction: Floats) -> list[int]:
-        """The chosen parameters if they are worth it together: changes that are large singly may cancel each other."""
-        return chosen if self._worth(correction) else []
+        """The chosen parameters if together they move rows or depth by more than the usual error of a good calibration:
+        changes that are large singly may cancel each other."""
+        rows, depth = self._moves(correction)
+        worth = rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE or self._explains(correction)
+        return chosen if worth else []
 
     def _sigma(self, i: int, chosen: Sequence[int], fit: OrientationFit) -> float:
         """Standard deviation of a chosen parameter, radians, with that of what is held."""
@@ -213,11 +216,6 @@ class _Chooser:
         rows, depth = (math.sqrt(float(correction @ form @ correction)) for form in (self.rows, self.depth))
         return rows, depth
 
-    def _worth(self, correction: Floats) -> bool:
-        """Whether a correction (5,) moves rows or depth by more than the usual error of a good calibration."""
-        rows, depth = self._moves(correction)
-        return rows >= self.params.least_rows or depth >= MIN_DEPTH_CHANGE or self._explains(correction)
-
     def _explains(self, correction: Floats) -> bool:
         """Whether many matches lie beyond infinity, so that depth is surely wrong, and a correction (5,) explains them.
 
@@ -232,22 +230,16 @@ class _Chooser:
             able = [i for i in group if i not in chosen and self._refusal(i, chosen) is None]
             if not able:
                 return
-            chosen.append(max(able, key=lambda i: self._gain(i, chosen)))
+            gains = [self._solve([*chosen, i], rival=False)[2] for i in able]
+            chosen.append(able[int(np.argmax(gains))])
 
     def _solve(self, chosen: Sequence[int], *, rival: bool) -> tuple[Floats, Floats, float]:
         return solution(self.all, [i in chosen for i in range(RIG)], self.priors, rival=rival)
-
-    def _gain(self, i: int, chosen: list[int]) -> float:
-        return self._solve([*chosen, i], rival=False)[2]
 
     def _depth_error(self, i: int, chosen: list[int]) -> float:
         """Relative depth error by a parameter's uncertainty, with the principal point unknown."""
         covariance = self._solve([*chosen, i], rival=True)[1]
         return math.sqrt(float(self.depth[i, i] * covariance[i, i]))
-
-    def _knocked(self, i: int, chosen: list[int]) -> bool:
-        """Whether the camera was turned: another angle changed too, or no principal point explains the difference."""
-        return self.impossible or self._turned(i, chosen) or self._departs(i, chosen) >= 2.0
 
     def _departs(self, i: int, chosen: list[int]) -> float:
         """Standard deviations by which a parameter departs, with the principal point unknown."""
@@ -295,7 +287,8 @@ class _Chooser:
         contradicted = abs(asked.value) >= self.params.significance * asked.sigma
         if not contradicted and not (turned and abs(asked.value) >= asked.sigma):
             return f"not contradicted: the images say {asked}"
-        if not self._knocked(i, chosen):
+        # Else the camera was turned: another angle changed, too, or no principal point explains the difference.
+        if not (self.impossible or self._turned(i, chosen) or self._departs(i, chosen) >= 2.0):
             return (
                 f"likelier a principal point that is off, with the right depth, for no other angle departs: the images "
                 f"say {asked}, which is {100 * asked.depth:.1f} % of depth"

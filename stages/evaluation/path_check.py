@@ -46,12 +46,11 @@ def path_check(path: Floats, risk: Bytes, lattice: Lattice) -> dict[str, Metric]
     cells = crossed_cells(path, lattice)
     # Cells outside the exact map count as unknown, like its holes.
     kinds = lattice.values(risk, cells, UNKNOWN)
-    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
         "hazard_cells": metric(int((kinds == HAZARDOUS).sum()), "cells", f"crossed cells that are hazardous {truth}"),
         "unknown_cells": metric(int((kinds == UNKNOWN).sum()), "cells", f"crossed cells that are unknown {truth}"),
         "crossed_cells": metric(len(cells), "cells", "cells that the path crosses"),
-        "path_length": metric(length, "m", "length of the path, climbs included"),
+        "path_length": metric(float(lengths_along(path)[-1]), "m", "length of the path, climbs included"),
         "hazardous_share": share,
     }
 

@@ -97,15 +97,9 @@ def opened(path: str) -> Iterator[Archive]:
     FileNotFoundError
         There is none.
     """
-    with _broken(), _RegularFile(path) as file, Archive(file) as archive:
-        yield archive
-
-
-@contextmanager
-def _broken() -> Iterator[None]:
-    """Turn what readers say of a damaged file into :class:`BrokenError`."""
     try:
-        yield
+        with _RegularFile(path) as file, Archive(file) as archive:
+            yield archive
     except MALFORMED as error:
         raise BrokenError(str(error)) from None
     except OSError as error:

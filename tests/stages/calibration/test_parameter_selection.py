@@ -113,7 +113,7 @@ def test_noise_that_matches_in_a_sky_makes_no_change_worth_it():
         m.right[::8, 0] = m.left[::8, 0] + np.linspace(2.0, 90.0, len(m.right[::8]))
     chooser = parameter_selection._Chooser(rig, pairs, PARAMS)
     assert chooser.impossible
-    assert not chooser._worth(np.array([5e-5, 0.0, 0.0, 0.0, 0.0]))
+    assert not chooser._enough([0], chooser.all, np.array([5e-5, 0.0, 0.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("near", [False, True])
