@@ -612,6 +612,20 @@ def test_whole_seconds_stay_times(tmp_path, rate):
 
 
 @pytest.mark.parametrize(
+    ("name", "first", "step", "said"),
+    [("epoch", 1.7e9, 0.1, True), ("clock", 1_700_000_000, 1, True), ("frame", 0, 5, False), ("v", 1.5, 0, False)],
+)
+@pytest.mark.parametrize("pose", ["x,y,z,qx,qy,qz,qw", "x,y,z"])
+def test_a_column_that_may_be_the_time_is_told(tmp_path, pose, name, first, step, said):
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 1\n[truth]\nfile = "p.csv"\n', frames=5)
+    rest = ",0,0,0,1" * ("q" in pose)
+    write_lines(tmp_path / "p.csv", [f"{name},{pose}", *(f"{first + k * step},{7 - k},0,0{rest}" for k in range(5))])
+    s = opened(path)
+    assert s.truth or s.truth_positions
+    assert [name in line for line in s.warnings if "RIL-717" in line] == [True] * said
+
+
+@pytest.mark.parametrize(
     ("columns", "unread"),
     [
         ("rx,ry,rz", "rx, ry, rz"),
