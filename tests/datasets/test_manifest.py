@@ -224,6 +224,18 @@ def test_a_distortion_of_one_camera_alone_is_said(tmp_path, right, said):
     assert ["RIL-105" in line and "right" in line for line in lines] == [True] * said
 
 
+@pytest.mark.parametrize(("names", "said"), [("", 1), ('names = ["cam0", "cam2"]\n', 0)])
+def test_two_of_several_cameras_are_told(tmp_path, names, said):
+    one = "{}:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n  distortion_model: radtan\n"
+    one += "  distortion_coeffs: [0, 0, 0, 0]\n  resolution: {}\n"
+    link = "  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    chain = [one.format("cam0", [64, 48]), one.format("cam1", [640, 480]) + link, one.format("cam2", [64, 48]) + link]
+    (tmp_path / "chain.yaml").write_text("".join(chain))
+    s = opened(write_sequence(tmp_path, cameras=f'[cameras]\nfile = "chain.yaml"\n{names}', rig=""))
+    assert s.rig.baseline == pytest.approx(0.2)
+    assert ["cam0 is taken as the left and cam2" in line for line in s.warnings if "RIL-719" in line] == [True] * said
+
+
 def smaller_right_images(folder: Path) -> Path:
     """A sequence whose left images have 64 x 48 pixels and whose right ones half as many a side."""
     manifest = write_sequence(folder)
