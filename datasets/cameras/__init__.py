@@ -46,31 +46,15 @@ OTHERS = (
         "is Kalibr's report",
         "give camchain.yaml (or NAME-camchain.yaml), which stands beside it",
     ),
-    (
-        '"disto"',
-        "is of ZED's SDK",
-        "for its rectified images write fx, fy, cx, cy and baseline (m), for raw ones give SN...conf of the camera",
-    ),
+    ('"disto"', "is of ZED's SDK", "give SN...conf; for rectified images fx, fy, cx, cy and baseline (m)"),
     (
         '"(CameraParameters1|TranslationOfCamera2)"',
         "holds MATLAB's stereoParams",
         "write K1, D1, K2, D2, R and T (m) of [K1, D1, K2, D2, R, T] = stereoParametersToOpenCV(stereoParams)",
     ),
-    (
-        "[ \\t]*Camera[.]fxl",
-        "holds OV2SLAM's settings",
-        "write M1, D1 (k1 k2 p1 p2), M2, D2, R and T (m), as OpenCV's YAML",
-    ),
-    (
-        '"SettingsVersion"',
-        "holds AirSim's settings",
-        "write fx = fy = Width / 2 / tan(FOV_Degrees / 2), cx, cy (the centre) and baseline (m), the difference of Y",
-    ),
-    (
-        '"camera_data_"',
-        "is Argoverse's calibration",
-        "write fx, fy, cx, cy of stereo_front_left and baseline (m), the distance to stereo_front_right",
-    ),
+    (r"[ \t]*Camera[.]fxl", "holds OV2SLAM's settings", "write M1, D1 (k1 k2 p1 p2), M2, D2, R, T (m), as OpenCV does"),
+    ('"SettingsVersion"', "is AirSim's", "write fx = fy = Width / 2 / tan(FOV_Degrees / 2), cx, cy and baseline (m)"),
+    ('"camera_data_"', "is Argoverse's", "write fx, fy, cx, cy of stereo_front_left and baseline (m) of both"),
 )
 """Files that are not read: a pattern, what they are, and what to give in their place."""
 
