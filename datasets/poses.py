@@ -146,6 +146,7 @@ def poses_of(table: TextTable, format: str = "auto", unit: float | None = None) 
         table, left_out = table.measured(list(columns.values()), lost)
         warnings += left_out
     times = times_of(table, columns["time"]) if "time" in columns else None
+    warnings += by_name.unread_times(table, columns.values()) if times is None else ()
     poses = _posed(table, columns, unit)
     warnings += _rounded(np.array([pose.translation for pose in poses]), table.name)
     return TimedPoses(times, poses, table.name, warnings)
@@ -254,6 +255,7 @@ def positions_of(
     rows = _lengths(table, placed, unit)
     warnings += _rounded(rows, table.name)
     times, images = times_of(table, *timed) if timed else None, tuple(table.text(0)) if named else ()
+    warnings += () if timed or named else by_name.unread_times(table, placed)
     return TimedPositions(times, tuple(tuple(float(v) for v in row) for row in rows), table.name, warnings, images)
 
 

@@ -40,6 +40,24 @@ def states(entry: str) -> Text:
     return lambda text: re.search(rf"^[ \t]*{entry}", text, re.MULTILINE) is not None
 
 
+OTHERS = (
+    (
+        "^Calibration results",
+        "is Kalibr's report",
+        "give camchain.yaml (or NAME-camchain.yaml), which stands beside it",
+    ),
+    ('"disto"', "is of ZED's SDK", "give SN...conf; for rectified images fx, fy, cx, cy and baseline (m)"),
+    (
+        '"(CameraParameters1|TranslationOfCamera2)"',
+        "holds MATLAB's stereoParams",
+        "write K1, D1, K2, D2, R and T (m) of [K1, D1, K2, D2, R, T] = stereoParametersToOpenCV(stereoParams)",
+    ),
+    (r"[ \t]*Camera[.]fxl", "holds OV2SLAM's settings", "write M1, D1 (k1 k2 p1 p2), M2, D2, R, T (m), as OpenCV does"),
+    ('"SettingsVersion"', "is AirSim's", "write fx = fy = Width / 2 / tan(FOV_Degrees / 2), cx, cy and baseline (m)"),
+    ('"camera_data_"', "is Argoverse's", "write fx, fy, cx, cy of stereo_front_left and baseline (m) of both"),
+)
+"""Files that are not read: a pattern, what they are, and what to give in their place."""
+
 PLAIN: tuple[tuple[Text, Callable[[str, Path], list[CalibratedCamera]]], ...] = (
     (pds.is_label, pds.label),
     (states(r"fu[ \t]*="), tsai.tsai),
@@ -101,6 +119,9 @@ def read_cameras(path: Path) -> list[CalibratedCamera]:
 
 
 def _read(text: str, path: Path) -> list[CalibratedCamera]:
+    for pattern, what, remedy in OTHERS:
+        if re.search(pattern, text, re.MULTILINE):
+            raise InputError("RIL-727", f"{path} {what}: this is not read", remedy=remedy)
     # Before YAML, to which KITTI's `P0: 7.1 0 ...` is an entry of one word.
     plain = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
     for recognises, read in PLAIN:

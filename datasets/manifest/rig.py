@@ -61,7 +61,7 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     InputError
         The cameras or their relative pose are not stated, contradict the images, or are impossible.
     """
-    raw = _cameras(manifest.cameras, root, sizes)
+    raw, chosen = _cameras(manifest.cameras, root, sizes)
     left, right = (_rectified(camera) if rectified else camera for camera in raw)
     # Before lengths are compared: those of the manifest are metres.
     left, right = (_scaled(camera, manifest.rig.unit) for camera in (left, right))
@@ -77,16 +77,17 @@ def read_optics(manifest: Manifest, root: Path, sizes: Sizes, rectified: bool = 
     if left.lens != raw[0].lens and manifest.images.rectified is None:
         text = "the images are rectified by their name: their camera is P, without the distortion"
         lines.append(warning("RIL-817", f"{text} (state images.rectified = false in a manifest if they are raw)"))
-    return Optics(rig, lenses, up, (*lines, *unusual_cameras((left, right), sizes)))
+    return Optics(rig, lenses, up, (*chosen, *lines, *unusual_cameras((left, right), sizes)))
 
 
-def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
+def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[tuple[CalibratedCamera, ...], tuple[str, ...]]:
+    """Left and right camera, and a warning if they were chosen among several."""
     if section.left is not None and section.right is not None:
         stated = ("left", section.left, sizes[0]), ("right", section.right, sizes[1])
-        return tuple(_one(value, side, root, size) for side, value, size in stated)
-    found: tuple[CalibratedCamera, ...] = ()
+        return tuple(_one(value, side, root, size) for side, value, size in stated), ()
+    found, chosen = tuple[CalibratedCamera, ...](), tuple[str, ...]()
     if section.file is not None:
-        found = _of_file(section, root / section.file, sizes)
+        found, chosen = _of_file(section, root / section.file, sizes)
     elif section.stated:
         found = tuple(_one(section, side, root, sizes[0]) for side in ("left", "right"))
     if found and found[0].lens == found[1].lens and sizes[0] != sizes[1]:
@@ -94,7 +95,7 @@ def _cameras(section: Cameras, root: Path, sizes: Sizes) -> tuple[CalibratedCame
         text = f"left images have {left} pixels, right ones {right}, and one camera is stated for both"
         raise InputError("RIL-960", text, remedy="give cameras.left and cameras.right")
     if found:
-        return found
+        return found, chosen
     text = "the cameras are not known"
     remedy = "give cameras.file, cameras.left and cameras.right, or cameras.fx, cx and cy (px)"
     raise InputError("RIL-235", text, remedy=remedy)
@@ -128,24 +129,28 @@ def _one(value: str | PinholeLens, side: str, root: Path, size: tuple[int, int])
         return CalibratedCamera(side, Lens(camera, model, value.distortion), None)
 
 
-def _of_file(section: Cameras, path: Path, sizes: Sizes) -> tuple[CalibratedCamera, ...]:
-    """Left and right camera of one file; a single camera is used for both."""
-    found = read_cameras(path)
+def _of_file(section: Cameras, path: Path, sizes: Sizes) -> tuple[tuple[CalibratedCamera, ...], tuple[str, ...]]:
+    """Left and right camera of one file, and a warning if nobody has named them; a single camera is used for both."""
+    read = read_cameras(path)
     if section.names is not None:
-        by_name = {camera.name: camera for camera in found}
+        by_name = {camera.name: camera for camera in read}
         missing = [wanted for wanted in section.names if wanted not in by_name]
         if missing:
             text = f"cameras.names: {path} has no camera {missing[0]!r}"
             raise InputError("RIL-237", text, remedy=f"it has {', '.join(by_name)}")
-        return tuple(by_name[wanted] for wanted in section.names)
-    found = of_size(found, sizes)
+        return tuple(by_name[wanted] for wanted in section.names), ()
+    found = of_size(read, sizes)
     if len(found) > 2:
         text = f"{path} has {len(found)} cameras: {', '.join(camera.name for camera in found)}"
         raise InputError("RIL-238", text, remedy="say which two by cameras.names = [left, right]")
     if len(found) == 1:
         # Its pose, if any, is that of one camera: the manifest has to state the other.
-        return found[0], replace(found[0], name="right", T_camera_reference=None)
-    return found[0], found[1]
+        return (found[0], replace(found[0], name="right", T_camera_reference=None)), ()
+    if len(read) == 2:
+        return tuple(found), ()
+    text = f"{path} has {len(read)} cameras ({', '.join(camera.name for camera in read)}): by the size of the images"
+    text += f" {found[0].name} is taken as the left and {found[1].name} as the right one; cameras.names chooses others"
+    return tuple(found), (warning("RIL-719", text),)
 
 
 def _scaled(camera: CalibratedCamera, unit: float) -> CalibratedCamera:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -115,6 +115,20 @@ def stated_column(table: TextTable, stated: str | int) -> int:
         return stated - 1
     text = f"{table.name}: columns: there is no column {stated!r} of {', '.join(table.header) or table.columns}"
     raise InputError("RIL-806", text, remedy="give a name of its first line, or a number from 1")
+
+
+def unread_times(table: TextTable, read: Collection[int]) -> tuple[str, ...]:
+    """Warning about columns beside those that are ``read``, none of them the time, that grow as times do."""
+    others = [k for k in range(len(table.header)) if k not in read]
+    values = table.values(others)
+    # Whole numbers below 10^6 count rows or images; of fewer than four rows any column may grow by chance.
+    stamps = (np.diff(values, axis=0) > 0).all(axis=0) & ((values % 1 > 0) | (values >= 1e6)).any(axis=0)
+    grows = np.flatnonzero(stamps)
+    if len(values) < 4 or not grows.size:
+        return ()
+    names = " and ".join(table.header[others[k]] for k in grows)
+    text = f"{table.name}: no column is called time, its rows count as one a pair, and {names} is not read"
+    return (warning("RIL-717", f"{text}: if it is the time, call it time (time_ms, time_ns by its unit)"),)
 
 
 def unread_rotations(table: TextTable) -> tuple[str, ...]:

@@ -1139,7 +1139,7 @@ def test_middlebury_is_in_millimetres(tmp_path):
         (CAMODOCAL.format(kind="MEI", mirror="mirror_parameters: {xi: 1.9}\n", projection=USUAL), ("RIL-814", "MEI")),
         (CAMODOCAL.format(kind="SCARAMUZZA", mirror="", projection=USUAL), ("RIL-814", "SCARAMUZZA")),
         ("sensor_type: imu\nrate_hz: 200\n", ("RIL-100",)),
-        ('{"CameraParameters1":{"RadialDistortion":[0,0]},"TranslationOfCamera2":[-97,0,0]}', ("RIL-100", "MATLAB")),
+        ('{"CameraParameters1":{"RadialDistortion":[0,0]},"TranslationOfCamera2":[-97,0,0]}', ("RIL-727", "MATLAB")),
         ("<?xml version='1.0'?><calibration>\n <projection>frame</projection></calibration>", ("RIL-100", "OpenCV")),
         ("", ("RIL-100",)),
         ("just words\n", ("RIL-100",)),
@@ -1543,3 +1543,25 @@ def test_images_of_one_camera_that_were_made_smaller_are_refused_where_nothing_s
     sizes[halved] = (320, 240)
     with raises("RIL-974", f"of camera {(left, right)[halved].name} is", "the images are 320 x 240", "times 0.5"):
         rig_of(left, right, tuple(sizes))
+
+
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [
+        ("Calibration results\n=====\nCamera-system parameters:\n\tcam0 (/cam0/image_raw):\n", "camchain"),
+        (
+            '{"left_cam": {"fx": 700, "disto": [0, 0]}, "right_cam": {"fx": 700}, "R": [0, 0, 0], "T": [0.12, 0, 0]}',
+            "SN",
+        ),
+        ('{"CameraParameters1": {"K": [[700, 0, 600], [0, 700, 180], [0, 0, 1]]}}', "stereoParametersToOpenCV"),
+        ("%YAML:1.0\nCamera.fxl: 458.6\nCamera.fyl: 457.3\n", "M1, D1"),
+        ('{"SettingsVersion": 1.2, "Vehicles": {}}', "FOV_Degrees"),
+        ('{"camera_data_": []}', "stereo_front_left"),
+    ],
+)
+def test_files_of_others_say_what_to_give_instead(tmp_path, text, remedy):
+    path = tmp_path / "calibration.txt"
+    path.write_text(text)
+    with raises("RIL-727") as error:
+        read_cameras(path)
+    assert remedy in str(error.value)

@@ -224,6 +224,18 @@ def test_a_distortion_of_one_camera_alone_is_said(tmp_path, right, said):
     assert ["RIL-105" in line and "right" in line for line in lines] == [True] * said
 
 
+@pytest.mark.parametrize(("names", "said"), [("", 1), ('names = ["cam0", "cam2"]\n', 0)])
+def test_two_of_several_cameras_are_told(tmp_path, names, said):
+    one = "{}:\n  camera_model: pinhole\n  intrinsics: [60, 60, 31.5, 23.5]\n  distortion_model: radtan\n"
+    one += "  distortion_coeffs: [0, 0, 0, 0]\n  resolution: {}\n"
+    link = "  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    chain = [one.format("cam0", [64, 48]), one.format("cam1", [640, 480]) + link, one.format("cam2", [64, 48]) + link]
+    (tmp_path / "chain.yaml").write_text("".join(chain))
+    s = opened(write_sequence(tmp_path, cameras=f'[cameras]\nfile = "chain.yaml"\n{names}', rig=""))
+    assert s.rig.baseline == pytest.approx(0.2)
+    assert ["cam0 is taken as the left and cam2" in line for line in s.warnings if "RIL-719" in line] == [True] * said
+
+
 def smaller_right_images(folder: Path) -> Path:
     """A sequence whose left images have 64 x 48 pixels and whose right ones half as many a side."""
     manifest = write_sequence(folder)
@@ -609,6 +621,20 @@ def test_whole_seconds_stay_times(tmp_path, rate):
     assert [pose and pose.translation[0] for pose in s.truth] == [
         7 + k / rate if k % rate == 0 else None for k in range(5)
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "step", "said"),
+    [("epoch", 1.7e9, 0.1, True), ("clock", 1_700_000_000, 1, True), ("frame", 0, 5, False), ("v", 1.5, 0, False)],
+)
+@pytest.mark.parametrize("pose", ["x,y,z,qx,qy,qz,qw", "x,y,z"])
+def test_a_column_that_may_be_the_time_is_told(tmp_path, pose, name, first, step, said):
+    path = write_sequence(tmp_path, '[times]\nrate_hz = 1\n[truth]\nfile = "p.csv"\n', frames=5)
+    rest = ",0,0,0,1" * ("q" in pose)
+    write_lines(tmp_path / "p.csv", [f"{name},{pose}", *(f"{first + k * step},{7 - k},0,0{rest}" for k in range(5))])
+    s = opened(path)
+    assert s.truth or s.truth_positions
+    assert [name in line for line in s.warnings if "RIL-717" in line] == [True] * said
 
 
 @pytest.mark.parametrize(
