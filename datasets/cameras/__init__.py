@@ -52,7 +52,7 @@ OTHERS = (
         "holds MATLAB's stereoParams",
         "write K1, D1, K2, D2, R and T (m) of [K1, D1, K2, D2, R, T] = stereoParametersToOpenCV(stereoParams)",
     ),
-    (r"[ \t]*Camera[.]fxl", "holds OV2SLAM's settings", "write M1, D1 (k1 k2 p1 p2), M2, D2, R, T (m), as OpenCV does"),
+    ("Camera[.]fxl", "holds OV2SLAM's settings", "write M1, D1 (k1 k2 p1 p2), M2, D2, R, T (m), as OpenCV does"),
     ('"SettingsVersion"', "is AirSim's", "write fx = fy = Width / 2 / tan(FOV_Degrees / 2), cx, cy and baseline (m)"),
     ('"camera_data_"', "is Argoverse's", "write fx, fy, cx, cy of stereo_front_left and baseline (m) of both"),
 )

@@ -57,13 +57,16 @@ LOOP_DEFAULTS: Mapping[str, Any] = {
     "track.points": 400,
     "resect.joint": False,
     "locus.cell_size": 0.004,
+    "locus.least_facing": 0.0,
     "crosscheck.enabled": False,
     "drive.goal": (0.0, 1.0),
 }
 """Accurate terrain, because wheels meet edges that a map smooths away: of the cells with an edge above ``max_step``
 (six beds, three stops each) half as many have a probability below 0.3, none below 0.06 (0.5 %), and a tenth fewer cells
-are false hazards. A stop takes a quarter more time. Poses need no more points than by default. Each leg is a segment:
-with a joint adjustment its frames err less, but the pose at its end does not, and one of 15 drives lost its way."""
+are false hazards. Ground seen edge-on stays: without it stones close more ways (three beds at 10 %: 1.53, 2.07, 1.93
+times the shortest instead of 1.21, 1.00, 0.78). A stop takes a quarter more time. Poses need no more points than by
+default. Each leg is a segment: with a joint adjustment its frames err less, but the pose at its end does not, and one
+of 15 drives lost its way."""
 
 
 def mount(p: SetupParams, camera: str) -> RigidTransform:

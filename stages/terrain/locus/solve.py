@@ -35,6 +35,7 @@ class LocusParams(Params):
     refine_steps : number of Gauss-Newton steps that refine the elevations by both images; 6 for matches of preset fast,
         3 for others; 0: none.
     both : also match from right to left and use both elevations; doubles the time of matching.
+    least_facing : least area of ground in the image over that of level ground; what is seen more edge-on is left out.
     """
 
     cell_size: float | None = Field(None, gt=0)
@@ -44,6 +45,7 @@ class LocusParams(Params):
     sigma_disparity: float = Field(0.2, gt=0)
     refine_steps: int = Field(3, ge=0, le=20)
     both: bool = False
+    least_facing: float = Field(0.3, ge=0, lt=1)
 
 
 def observed(matches: Matches, image: ArrayLike, rig: Rig, params: LocusParams) -> Observed:

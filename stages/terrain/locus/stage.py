@@ -137,7 +137,7 @@ def _refine(dem: Dem, views: SurfaceViews, lattice: Lattice, params: LocusParams
     dem.elevation_std[...] = standard_deviation(elevation, seen, turned, moved, apart, dem.elevation_std)
     dem.elevation[...] = elevation
     dem.ortho[...] = np.clip(seen.left, 0.0, 255.0)
-    _leave_out(dem, edge_on(turned, HOLE_SIDE_CELLS))
+    _leave_out(dem, edge_on(turned, params.least_facing, HOLE_SIDE_CELLS))
 
 
 def greatest_std(params: LocusParams, measured: bool) -> float | None:

@@ -19,7 +19,7 @@ both directions of matching (RMS of 5 x 5 cells), :data:`ONE_SIDED_DIFFERENCE_PX
 there was one direction.
 
 v: the area in the image of 5 x 5 sloping cells over that of level ground there; 0 is seen edge-on, less cannot be seen,
-and what is below .3 is left out (:func:`rille.stages.terrain.locus.views.edge_on`).
+and what is below locus.least_facing is left out (:func:`rille.stages.terrain.locus.views.edge_on`).
 Where v is small a matching window covers more ground, some of which hides other ground.
 
 The factors are those of a fit by non-negative least squares to the squared errors of pairs of the simulator (both

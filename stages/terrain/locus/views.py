@@ -88,17 +88,14 @@ def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> 
     return np.where(np.isfinite(share), share, 1.0).astype(np.float32)
 
 
-LEAST_FACING = 0.3
-"""Least area of ground in the image over that of level ground. Less is mostly no ground: a match is that of a window,
-and so is what joins the edge of a stone to the ground behind it, seen edge-on and above what the stone hides."""
+def edge_on(area: Floats32, least: float, side: int) -> Bools:
+    """Cells (rows, cols) that the camera sees edge-on, by their area in the image (:func:`facing`), ``least`` if seen.
 
-
-def edge_on(area: Floats32, side: int) -> Bools:
-    """Cells (rows, cols) that the camera sees edge-on, by their area in the image (:func:`facing`).
-
-    Gaps of less than ``side`` cells between them count as well: the slope there is that of noise.
+    Less is mostly no ground: a match is that of a window, and so is what joins the edge of a stone to the ground behind
+    it, seen edge-on and above what the stone hides. Gaps of less than ``side`` cells between them count as well: the
+    slope there is that of noise.
     """
-    found = (area < LEAST_FACING).astype(np.uint8)
+    found = (area < least).astype(np.uint8)
     return np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)) != 0)
 
 
