@@ -344,8 +344,8 @@ def complete(
         # A filled pixel takes its neighbour's depth but its own epipolar line: on turned rigs rows change along a row.
         across[:] = epipolar.settled(epipolar.transposed(f) if ending.upright else f, along, across, done)
     matches &= ~alone
-    by_noise = results["noise"], results["likeness"]
-    std = refinement.standard_deviation(*by_noise, v if ending.upright else u, keep & ~alone)
+    disparity = v if ending.upright else u
+    std = refinement.standard_deviation(results["noise"], results["likeness"], disparity, keep & ~alone)
     std[on_plane & matches] = plane_std[on_plane & matches]
     # A masked pixel is no part of the image, so it is not filled either.
     filled[valid == 0] = 0

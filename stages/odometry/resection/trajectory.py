@@ -258,9 +258,9 @@ def _lost(frames: Sequence[int], piece: NDArray[np.int16], causes: Mapping[int, 
         bridged = len(sides) == 2 and piece[sides[0]] == piece[sides[1]]
         how = f"bridged from {frames[sides[0]]} to {frames[sides[1]]}" if bridged else "no pose"
         fates.append((row, causes.get(frames[row], "no frame beside it could be posed with it"), how))
-    alone = [cause.partition(VIEW_MOVES)[0] for _, cause, _ in fates]
-    keys = [(row - k, re.sub(r"[0-9.]+", "#", alone[k]), how) for k, (row, _, how) in enumerate(fates)]
-    for _, group in groupby(zip(keys, alone, fates, strict=True), itemgetter(0)):
+    words = [cause.partition(VIEW_MOVES)[0] for _, cause, _ in fates]
+    keys = [(row - k, re.sub(r"[0-9.]+", "#", words[k]), how) for k, (row, _, how) in enumerate(fates)]
+    for _, group in groupby(zip(keys, words, fates, strict=True), itemgetter(0)):
         (_, cause, (row, whole, how)), *others = group
         if others:
             like = "" if all(other == cause for _, other, _ in others) else ", the first"

@@ -89,7 +89,7 @@ def facing(elevation: Floats32, lattice: Lattice, centre: Floats, side: int) -> 
 
 
 def edge_on(area: Floats32, least: float, side: int) -> Bools:
-    """Cells (rows, cols) that the camera sees edge-on, by their area in the image (:func:`facing`), ``least`` if seen.
+    """Cells (rows, cols) that the camera sees edge-on: their area in the image (:func:`facing`) is below ``least``.
 
     Less is mostly no ground: a match is that of a window, and so is what joins the edge of a stone to the ground behind
     it, seen edge-on and above what the stone hides. Gaps of less than ``side`` cells between them count as well: the
